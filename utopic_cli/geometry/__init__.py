@@ -1,0 +1,1 @@
+"""Points and rigid motions in NumPy float64: the tools the other rooms share."""

@@ -1,0 +1,1 @@
+"""The network of the paper, as inference needs it (torch, float32)."""

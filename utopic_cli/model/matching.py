@@ -1,0 +1,64 @@
+"""Affinity matching (Sec. 3.3.3): a learned similarity, slack for unmatched points, Sinkhorn."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+def sinkhorn(affinity: Tensor, iterations: int) -> Tensor:
+    """Turn affinities into a soft correspondence matrix with a slack row and column.
+
+    Works in scaling form, u = 1 / (E v + 1), v = 1 / (E^T u + 1) with E = exp(affinity): the
+    slack entries have affinity 0 and are normalised along one side only, so rows and columns
+    of the result sum to one over real and slack entries (columns exactly, rows in the limit).
+
+    Args:
+        affinity: (B, N, M) float32.
+        iterations: rounds of row and column normalisation.
+
+    Returns:
+        (B, N + 1, M + 1) float32; last row and column are slack, their corner 0.
+    """
+    kernel = affinity.float().clamp_max(30.0).exp()
+    column_scale = kernel.new_ones(kernel.shape[0], kernel.shape[2], 1)  # v
+    row_scale = kernel.new_ones(kernel.shape[0], kernel.shape[1], 1)  # u
+    for _ in range(iterations):
+        row_scale = 1.0 / (kernel @ column_scale + 1.0)
+        column_scale = 1.0 / (kernel.transpose(1, 2) @ row_scale + 1.0)
+    core = row_scale * kernel * column_scale.transpose(1, 2)
+    scores = torch.cat([core, row_scale], dim=2)  # (B, N, M + 1)
+    corner = torch.zeros_like(column_scale[:, :1])
+    return torch.cat([scores, torch.cat([column_scale, corner], dim=1).transpose(1, 2)], dim=1)
+
+
+def _instance_norm(matrix: Tensor) -> Tensor:
+    """Zero mean and unit variance over each (N, M) map of a batch."""
+    centred = matrix - matrix.mean(dim=(1, 2), keepdim=True)
+    return centred * torch.rsqrt(centred.square().mean(dim=(1, 2), keepdim=True) + 1e-6)
+
+
+class AffinityMatching(nn.Module):
+    """A_ij = f_i^T W f_j with a learnable symmetric W, instance norm, Sinkhorn."""
+
+    def __init__(self, width: int, iterations: int, descriptor_skip: bool) -> None:
+        """Build for features of ``width`` channels."""
+        super().__init__()
+        self.iterations = iterations
+        self.weight = nn.Parameter(torch.eye(width) + 0.02 * torch.randn(width, width))
+        # Gain and bias of the norm: the start makes most points slack, a few matched.
+        self.gain = nn.Parameter(torch.tensor(1.5 if descriptor_skip else 3.0))
+        self.bias = nn.Parameter(torch.tensor(-6.0))
+        self.skip_gain = nn.Parameter(torch.tensor(2.5)) if descriptor_skip else None
+
+    def forward(self, source: Tensor, target: Tensor, similarity: Tensor) -> Tensor:
+        """Match features (B, N, V) and (B, M, V), with the descriptors' similarity (B, N, M).
+
+        Returns:
+            (B, N + 1, M + 1) soft correspondences with slack.
+        """
+        symmetric = 0.5 * (self.weight + self.weight.T)
+        affinity = self.gain * _instance_norm(((source @ symmetric) @ target.transpose(1, 2)).float())
+        if self.skip_gain is not None:
+            affinity = affinity + self.skip_gain * _instance_norm(similarity.float())
+        return sinkhorn(affinity + self.bias, self.iterations)

@@ -1,0 +1,86 @@
+"""Uncertainty quantification and uncertainty-aware weighting (Sec. 3.3.2, 3.3.3)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+
+class OverlapDistribution(NamedTuple):
+    """The learned distribution of each point's overlap and samples of it.
+
+    Attributes:
+        mean: (B, N) mu, in logits.
+        log_variance: (B, N) log sigma^2, in logits squared.
+        samples: (B, K, N) overlap scores in [0, 1].
+        raw_uncertainty: (B, N) variance of the samples, not normalised.
+    """
+
+    mean: Tensor
+    log_variance: Tensor
+    samples: Tensor
+    raw_uncertainty: Tensor
+
+
+class UncertaintyQuantification(nn.Module):
+    """Predict a Gaussian overlap per point, draw from it, take the variance (Eq. 8)."""
+
+    def __init__(self, width: int, scheme: str, samples: int) -> None:
+        """Build; ``scheme`` is ``sampled``, ``predicted`` or ``none`` (which still predicts the mean)."""
+        super().__init__()
+        self.scheme, self.samples = scheme, samples
+        self.mean = nn.Linear(width, 1)
+        self.log_variance = nn.Linear(width, 1)
+
+    def forward(self, features: Tensor, generator: torch.Generator) -> OverlapDistribution:
+        """Quantify features (B, N, V); ``generator`` draws the K samples on the CPU."""
+        mean = self.mean(features).squeeze(-1).float()
+        log_variance = self.log_variance(features).squeeze(-1).float().clamp(-8.0, 4.0)
+        shape = (mean.shape[0], self.samples, mean.shape[1])
+        noise = torch.randn(shape, generator=generator).to(mean.device)
+        deviation = (0.5 * log_variance).exp()
+        samples = torch.sigmoid(mean[:, None] + noise * deviation[:, None])
+        raw = deviation if self.scheme == "predicted" else samples.var(dim=1, unbiased=False)
+        return OverlapDistribution(mean, log_variance, samples, raw)
+
+
+def normalise_uncertainty(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Min-max normalise raw uncertainties (B, N) and (B, M) over each pair; flat maps to 0."""
+    both = torch.cat([source, target], dim=1)
+    low = both.min(dim=1, keepdim=True).values
+    span = both.max(dim=1, keepdim=True).values - low
+    scale = torch.where(span > 1e-9, 1.0 / span.clamp_min(1e-9), torch.zeros_like(span))
+    return (source - low) * scale, (target - low) * scale
+
+
+class UncertaintyWeighting(nn.Module):
+    """Fuse a point's features with those it corresponds to, and fade them by uncertainty."""
+
+    def __init__(self, width: int) -> None:
+        """Build for features of ``width`` channels."""
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, width))
+
+    def forward(
+        self, features: Tensor, other: Tensor, scores: Tensor, uncertainty: Tensor | None, keep: Tensor | None
+    ) -> Tensor:
+        """Return uncertainty-aware features.
+
+        Args:
+            features: (B, N, V) of this cloud.
+            other: (B, M, V) of the other cloud.
+            scores: (B, N, M) soft correspondences from this cloud to the other.
+            uncertainty: (B, N) in [0, 1], or None for the variant without uncertainty.
+            keep: (B, N) bool, False for points masked out in training, or None.
+
+        Returns:
+            (B, N, V): MLP(cat[F, C F_other]) * (1 - U), masked points zeroed.
+        """
+        fused = self.mlp(torch.cat([features, scores.to(other.dtype) @ other], dim=-1))
+        if uncertainty is not None:
+            fused = fused * (1.0 - uncertainty[..., None])
+        if keep is not None:
+            fused = fused * keep[..., None]
+        return fused

@@ -1,0 +1,309 @@
+"""The data path from two clouds to a result: prepare, predict, solve, refine, carry back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch
+
+from utopic_cli.bridge import to_cloud_input
+from utopic_cli.config import SOLVERS, AlignOptions
+from utopic_cli.errors import InputError, UsageError
+from utopic_cli.estimation.refinement import refine
+from utopic_cli.estimation.solver import Estimate, Problem, solve
+from utopic_cli.estimation.surface import point_spacing
+from utopic_cli.estimation.verification import measure_fit
+from utopic_cli.geometry import rigid
+from utopic_cli.io.scan import read_scan
+from utopic_cli.model.utopic import Utopic
+from utopic_cli.model.weights import choose_device, load_weights
+from utopic_cli.point_cloud import PointCloud
+from utopic_cli.preprocess import PreparedPair, carry_to_all, prepare
+from utopic_cli.result import Correspondences, RegistrationResult
+
+Progress = Callable[[str], None]
+
+UNIT_MISMATCH = 20.0
+"""Extents that differ by more than this factor are named as a likely mix-up of units."""
+
+COUNTERPART_REACH = 3.0
+"""A point has a counterpart within this many spacings of the sparser scan."""
+
+
+@dataclass(frozen=True)
+class NetworkView:
+    """What the network says about the sampled points of one pair, as float64 arrays.
+
+    Attributes:
+        matching_scores: (N, M) soft correspondences without slack.
+        source_overlap: (N,), target_overlap: (M,) probabilities.
+        source_uncertainty: (N,), target_uncertainty: (M,) min-max normalised over the pair.
+        source_raw: (N,), target_raw: (M,) un-normalised.
+    """
+
+    matching_scores: np.ndarray
+    source_overlap: np.ndarray
+    target_overlap: np.ndarray
+    source_uncertainty: np.ndarray
+    target_uncertainty: np.ndarray
+    source_raw: np.ndarray
+    target_raw: np.ndarray
+
+
+def align(
+    source: str | PathLike[str] | np.ndarray,
+    target: str | PathLike[str] | np.ndarray,
+    *,
+    initial: np.ndarray | None = None,
+    **options: Any,
+) -> RegistrationResult:
+    """Align two scans: ``p_target = T_target_source @ p_source``.
+
+    Args:
+        source: the scan that moves: a file, or an (N, 3) array in any unit and pose.
+        target: the scan that stays: a file, or an (M, 3) array in the same unit.
+        initial: (4, 4) transformation to try first.
+        **options: fields of ``AlignOptions``: weights, points, refine, solver, device,
+            threads, seed.
+
+    Raises:
+        InputError: a scan can't be used.
+        UsageError: an unknown option.
+    """
+    try:
+        settings = AlignOptions(**options)
+    except TypeError as error:
+        known = ", ".join(AlignOptions.__dataclass_fields__)
+        raise UsageError(f"{error}; known options: {known}") from error
+    clouds = [_as_cloud(scan, name) for scan, name in ((source, "source"), (target, "target"))]
+    return register(clouds[0], clouds[1], settings, initial=initial)
+
+
+def register(
+    source: PointCloud,
+    target: PointCloud,
+    options: AlignOptions,
+    *,
+    initial: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> RegistrationResult:
+    """Register two clouds.
+
+    Args:
+        source: the cloud that moves.
+        target: the cloud that stays.
+        options: see ``AlignOptions``.
+        initial: (4, 4) transformation in file units to try first.
+        progress: called with the name of each step as it starts.
+
+    Returns:
+        The transformation, overlap and uncertainty of every original point, and measures.
+
+    Raises:
+        InputError: the weights can't be used, or no transformation follows from the scans.
+        UsageError: an unknown solver.
+    """
+    if options.solver not in SOLVERS:
+        raise UsageError(f"{options.solver}: no such solver; choose {', '.join(SOLVERS)}")
+    if options.points < 50:
+        raise UsageError(f"{options.points} points are too few for the network; give at least 50")
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    clock = _Clock(progress)
+
+    clock.start("load weights")
+    model, card = _network(options.weights, options.device)
+    clock.start("prepare")
+    prepared = prepare(source, target, options.points)
+    clock.start("predict")
+    view = predict(model, prepared, options.seed)
+    clock.start("solve")
+    estimate = _solve(prepared, view, options.solver, initial)
+    transformation = prepared.denormalise(estimate.T_target_source)
+    if options.refine:
+        clock.start("refine")
+        transformation = refine(source, target, transformation).T_target_source
+    clock.start("measure")
+    correspondences = _in_original_points(estimate.correspondences, prepared)
+    threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
+    fit = measure_fit(
+        source,
+        target,
+        transformation,
+        threshold,
+        correspondence_residuals=_residuals(source, target, correspondences, transformation),
+    )
+    clock.start("carry to all points")
+    source_all = _carry(source, prepared.source_centre, prepared.scale, prepared.source.points,
+                        view.source_overlap, view.source_uncertainty)  # fmt: skip
+    target_all = _carry(target, prepared.target_centre, prepared.scale, prepared.target.points,
+                        view.target_overlap, view.target_uncertainty)  # fmt: skip
+    return RegistrationResult(
+        T_target_source=transformation,
+        confidence=None,
+        trusted=None,
+        reasons=("these weights carry no calibration, so there is no verdict on this result",),
+        ambiguous_with=tuple(prepared.denormalise(rival.T_target_source) for rival in estimate.rivals),
+        source_overlap=source_all[:, 0],
+        target_overlap=target_all[:, 0],
+        source_uncertainty=source_all[:, 1],
+        target_uncertainty=target_all[:, 1],
+        raw_uncertainty=_summary(view),
+        correspondences=correspondences,
+        fit=fit,
+        timings_s=clock.stop(),
+        warnings=_warnings(source, target),
+        weights_name=str(card["name"]),
+        weights_sha256=str(card["sha256"]),
+        options=asdict(options),
+    )
+
+
+def predict(model: Utopic, prepared: PreparedPair, seed: int) -> NetworkView:
+    """Run the network on a prepared pair, on the device its weights are on."""
+    device = next(model.parameters()).device
+    k = model.config.neighbours
+    with torch.inference_mode():
+        prediction = model(
+            to_cloud_input(prepared.source, prepared.spacing, k).to(device),
+            to_cloud_input(prepared.target, prepared.spacing, k).to(device),
+            generator=torch.Generator().manual_seed(seed),
+        )
+    return NetworkView(
+        _array(prediction.matching_scores[:, :-1, :-1]),
+        _array(prediction.source_overlap),
+        _array(prediction.target_overlap),
+        _array(prediction.source_uncertainty),
+        _array(prediction.target_uncertainty),
+        _array(prediction.source_distribution.raw_uncertainty),
+        _array(prediction.target_distribution.raw_uncertainty),
+    )
+
+
+@lru_cache(maxsize=2)
+def _network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
+    model, card = load_weights(weights)
+    return model.to(choose_device(device)), card
+
+
+def _solve(
+    prepared: PreparedPair, view: NetworkView, solver: str, initial: np.ndarray | None
+) -> Estimate:
+    problem = Problem(
+        source_nodes=prepared.source.points,
+        target_nodes=prepared.target.points,
+        matching_scores=view.matching_scores,
+        source_overlap=view.source_overlap,
+        target_overlap=view.target_overlap,
+        source_certainty=1.0 - view.source_uncertainty,
+        target_certainty=1.0 - view.target_uncertainty,
+        source_dense=prepared.source.dense,
+        target_dense=prepared.target.dense,
+        spacing=prepared.spacing,
+    )
+    try:
+        return solve(problem, solver, None if initial is None else prepared.normalise(initial))
+    except ValueError as error:
+        raise InputError(f"no transformation can be found between these scans: {error}") from error
+
+
+def _as_cloud(scan: str | PathLike[str] | np.ndarray, name: str) -> PointCloud:
+    """Read a file, or check an array: (N, 3), at least 50 finite points after dropping NaN."""
+    if not isinstance(scan, np.ndarray):
+        return read_scan(scan).cloud
+    points = np.asarray(scan, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name}: an array of shape {points.shape}; expected (N, 3)")
+    points = points[np.isfinite(points).all(axis=1)]
+    distinct = np.unique(points, axis=0)
+    if len(distinct) < 50:
+        raise InputError(f"{name}: {len(distinct)} distinct finite points; at least 50 are needed")
+    extents = np.linalg.svd(distinct - distinct.mean(axis=0), compute_uv=False)
+    if extents[1] < 1e-9 * extents[0]:
+        raise InputError(f"{name}: all points lie on one line; nothing can be aligned")
+    return PointCloud(points)
+
+
+def _in_original_points(nodes: Correspondences, prepared: PreparedPair) -> Correspondences:
+    return Correspondences(
+        prepared.source.node_index[nodes.source_indices],
+        prepared.target.node_index[nodes.target_indices],
+        nodes.weights,
+    )
+
+
+def _residuals(
+    source: PointCloud, target: PointCloud, pairs: Correspondences, transformation: np.ndarray
+) -> np.ndarray:
+    """Return the (K,) distances of the correspondences under a transformation, in file units."""
+    moved = rigid.apply(transformation, source.points[pairs.source_indices])
+    return np.linalg.norm(moved - target.points[pairs.target_indices], axis=1)
+
+
+def _carry(
+    cloud: PointCloud,
+    centre: np.ndarray,
+    scale: float,
+    nodes: np.ndarray,
+    overlap: np.ndarray,
+    uncertainty: np.ndarray,
+) -> np.ndarray:
+    """Carry overlap and uncertainty from nodes to every original point -> (N, 2) float32 in [0, 1]."""
+    values = carry_to_all((cloud.points - centre) / scale, nodes, np.stack([overlap, uncertainty], axis=1))
+    return np.clip(values, 0.0, 1.0)
+
+
+def _summary(view: NetworkView) -> dict[str, float]:
+    both = np.concatenate([view.source_raw, view.target_raw])
+    return {
+        "source_mean": float(view.source_raw.mean()),
+        "target_mean": float(view.target_raw.mean()),
+        "p50": float(np.percentile(both, 50)),
+        "p90": float(np.percentile(both, 90)),
+    }
+
+
+def _warnings(source: PointCloud, target: PointCloud) -> tuple[str, ...]:
+    extents = [float(np.linalg.norm(np.ptp(cloud.points, axis=0))) for cloud in (source, target)]
+    ratio = max(extents) / min(extents)
+    if ratio < UNIT_MISMATCH:
+        return ()
+    return (f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?",)
+
+
+def _array(batch: torch.Tensor) -> np.ndarray:
+    """Return the only item of a batch as float64."""
+    return batch[0].detach().cpu().numpy().astype(np.float64)
+
+
+class _Clock:
+    """Seconds per step, and a word to whoever watches when a step starts."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
+        self._seconds: dict[str, float] = {}
+        self._step = ""
+        self._since = 0.0
+
+    def start(self, step: str) -> None:
+        """End the step in hand and start another."""
+        self._end()
+        self._step, self._since = step, time.perf_counter()
+        if self._progress is not None:
+            self._progress(step)
+
+    def stop(self) -> dict[str, float]:
+        """End the last step and return seconds by step."""
+        self._end()
+        return self._seconds
+
+    def _end(self) -> None:
+        if self._step:
+            self._seconds[self._step] = time.perf_counter() - self._since
+        self._step = ""

@@ -1,0 +1,280 @@
+"""From two raw clouds to what the network sees, and back: one frame, one scale, one density.
+
+Both clouds of a pair are centred, divided by one common scale, and sampled with one common
+node spacing h; the dense scan around each sampled point is kept as its local geometry. No
+unit, radius or voxel size is asked for: h follows from the clouds. Training and inference
+share this file, so what the network is shown never differs between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from utopic_cli.geometry.normals import estimate_normals, orient_normals, orient_towards
+from utopic_cli.geometry.voxel import cell_means, voxel_downsample, voxel_index
+from utopic_cli.point_cloud import PointCloud
+
+NEIGHBOURS = 20
+"""Graph neighbours kept per sampled point; the network takes the first k of its setting."""
+
+PATCHES = ((1.8, 32), (3.6, 24), (7.2, 24))
+"""Radius in node spacings and number of points of the three local-geometry patches."""
+
+DENSE_RATIO = 2.2
+"""Node spacing over the voxel size of the dense cloud."""
+
+MOST_POINTS = 400_000
+"""A larger cloud is thinned evenly to about this many points before anything else."""
+
+
+@dataclass(frozen=True)
+class SampledCloud:
+    """One cloud of a pair in normalised units.
+
+    Attributes:
+        points: (N, 3) float64 sampled points (nodes).
+        normals: (N, 3) float64 oriented unit normals of the nodes.
+        neighbours: (N, k) int64 nearest nodes, nearest first.
+        patches: three arrays (N, K, 6) float32: offset over radius, neighbour's normal.
+        patch_masks: three arrays (N, K) bool.
+        dense: the dense cloud with oriented normals, for estimation.
+        node_index: (N,) int64 original point nearest to each node.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    neighbours: np.ndarray
+    patches: tuple[np.ndarray, ...]
+    patch_masks: tuple[np.ndarray, ...]
+    dense: PointCloud
+    node_index: np.ndarray
+
+
+@dataclass(frozen=True)
+class PreparedPair:
+    """Two clouds ready for the network, and the way back to file units.
+
+    Attributes:
+        source: sampled source; ``normalised = (p - source_centre) / scale``.
+        target: sampled target; ``normalised = (p - target_centre) / scale``.
+        source_centre: (3,) file units.
+        target_centre: (3,) file units.
+        scale: file units per normalised unit.
+        spacing: node spacing h in normalised units.
+    """
+
+    source: SampledCloud
+    target: SampledCloud
+    source_centre: np.ndarray
+    target_centre: np.ndarray
+    scale: float
+    spacing: float
+
+    def denormalise(self, transformation: np.ndarray) -> np.ndarray:
+        """Take a (4, 4) transformation between normalised clouds to file units."""
+        result = transformation.copy()
+        rotation = transformation[:3, :3]
+        result[:3, 3] = (
+            self.scale * transformation[:3, 3] + self.target_centre - rotation @ self.source_centre
+        )
+        return result
+
+    def normalise(self, transformation: np.ndarray) -> np.ndarray:
+        """Take a (4, 4) transformation in file units to the normalised clouds."""
+        result = transformation.copy()
+        rotation = transformation[:3, :3]
+        result[:3, 3] = (
+            transformation[:3, 3] - self.target_centre + rotation @ self.source_centre
+        ) / self.scale
+        return result
+
+
+def prepare(
+    source: PointCloud,
+    target: PointCloud,
+    points: int,
+    *,
+    source_viewpoint: np.ndarray | None = None,
+    target_viewpoint: np.ndarray | None = None,
+) -> PreparedPair:
+    """Centre, scale and sample a pair.
+
+    Args:
+        source: points in file units.
+        target: points in file units.
+        points: most sampled points per cloud.
+        source_viewpoint: (3,) where the scanner stood, in the source's own frame, if known:
+            normals then face it, which is faster than propagating signs.
+        target_viewpoint: likewise for the target.
+    """
+    centres = [cloud.points.mean(axis=0) for cloud in (source, target)]
+    centred = [cloud.points - centre for cloud, centre in zip((source, target), centres, strict=True)]
+    scale = max(float(np.quantile(np.linalg.norm(part, axis=1), 0.99)) for part in centred)
+    thinned = [_thin(part / scale) for part in centred]
+    spacing = _common_spacing(thinned, points)
+    viewpoints = [
+        None if view is None else (view - centre) / scale
+        for view, centre in zip((source_viewpoint, target_viewpoint), centres, strict=True)
+    ]
+    sampled = [
+        sample(part, spacing, points, viewpoint=view)
+        for part, view in zip(thinned, viewpoints, strict=True)
+    ]
+    indexed = [
+        _with_node_index(cloud, part / scale) for cloud, part in zip(sampled, centred, strict=True)
+    ]
+    return PreparedPair(indexed[0], indexed[1], centres[0], centres[1], scale, spacing)
+
+
+def sample(
+    points: np.ndarray, spacing: float, most: int, *, viewpoint: np.ndarray | None = None
+) -> SampledCloud:
+    """Sample nodes of one normalised cloud and collect the local geometry around them.
+
+    Args:
+        points: (P, 3) normalised points.
+        spacing: node spacing h.
+        most: a cloud of no more points than this keeps every point as a node.
+        viewpoint: (3,) scanner position in the same frame, or None.
+    """
+    dense, _ = voxel_downsample(points, spacing / DENSE_RATIO)
+    normals = estimate_normals(dense, neighbours=30, radius=3.0 * spacing / DENSE_RATIO)
+    if viewpoint is None:
+        normals = orient_normals(dense, normals)
+    else:
+        normals = orient_towards(dense, normals, viewpoint)
+
+    owner, count = voxel_index(dense, spacing)
+    nodes, node_normals = cell_means(dense, owner, count), _cell_normals(normals, owner, count)
+    middle = (nodes, node_normals)
+    if len(points) <= most:
+        # Sparse clouds are used whole; each point takes the normal of the dense point it fell in.
+        nodes = np.unique(points, axis=0)
+        node_normals = normals[cKDTree(dense).query(nodes)[1]]
+    owner, count = voxel_index(dense, 2.0 * spacing)
+    coarse = (cell_means(dense, owner, count), _cell_normals(normals, owner, count))
+
+    k = min(NEIGHBOURS + 1, len(nodes))
+    neighbours = cKDTree(nodes).query(nodes, k=k)[1][:, 1:]
+    patches, masks = [], []
+    for (cloud, cloud_normals), (reach, size) in zip(
+        ((dense, normals), middle, coarse), PATCHES, strict=True
+    ):
+        patch, mask = _patch(nodes, cloud, cloud_normals, reach * spacing, size)
+        patches.append(patch)
+        masks.append(mask)
+    return SampledCloud(
+        points=nodes,
+        normals=node_normals,
+        neighbours=neighbours,
+        patches=tuple(patches),
+        patch_masks=tuple(masks),
+        dense=PointCloud(dense, normals),
+        node_index=np.empty(0, dtype=np.int64),
+    )
+
+
+def carry_to_all(points: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Carry values at nodes to every point: inverse-distance mean over the three nearest nodes.
+
+    Args:
+        points: (P, 3), same frame as the nodes.
+        nodes: (N, 3).
+        values: (N, C).
+
+    Returns:
+        (P, C) float32.
+    """
+    k = min(3, len(nodes))
+    distance, index = cKDTree(nodes).query(points, k=k, workers=-1)
+    weight = 1.0 / (distance.reshape(len(points), k) ** 2 + 1e-12)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.einsum("pk,pkc->pc", weight, values[index.reshape(len(points), k)]).astype(np.float32)
+
+
+def _thin(points: np.ndarray) -> np.ndarray:
+    """Thin a very large cloud by a fine grid, so that memory and time stay bounded."""
+    if len(points) <= MOST_POINTS:
+        return points
+    size = 2.0 / 400.0
+    for _ in range(8):
+        thinned, _ = voxel_downsample(points, size)
+        if len(thinned) <= MOST_POINTS:
+            return thinned
+        size *= 1.4
+    return thinned
+
+
+def _common_spacing(clouds: list[np.ndarray], most: int) -> float:
+    """Find one node spacing for both clouds: the finest the denser-covered one allows.
+
+    A cloud with more than ``most`` points gets the voxel size that leaves about ``most``
+    nodes; a sparser cloud has the spacing of its own points. The coarser of the two holds.
+    """
+    return max(
+        _voxel_size_for(points, most) if len(points) > most else _own_spacing(points)
+        for points in clouds
+    )
+
+
+def _voxel_size_for(points: np.ndarray, most: int) -> float:
+    """Return the voxel size that leaves at most, and nearly, ``most`` cells."""
+    low, high = 1e-4, 2.0
+    for _ in range(14):
+        size = float(np.sqrt(low * high))
+        if voxel_index(points, size)[1] > most:
+            low = size
+        else:
+            high = size
+        if high / low < 1.015:
+            break
+    return max(high, _own_spacing(points) if len(points) < 4 * most else 0.0)
+
+
+def _own_spacing(points: np.ndarray) -> float:
+    """Return the voxel size that would give a cloud's own density: 0.75 of the 8th neighbour's distance."""
+    k = min(9, len(points))
+    return float(0.75 * np.median(cKDTree(points).query(points, k=k)[0][:, -1]))
+
+
+def _cell_normals(normals: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
+    mean = cell_means(normals, owner, count)
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    first = np.zeros(count, dtype=np.int64)
+    first[owner] = np.arange(len(owner))
+    return np.where(length > 1e-3, mean / np.maximum(length, 1e-3), normals[first])
+
+
+def _patch(
+    nodes: np.ndarray, cloud: np.ndarray, normals: np.ndarray, radius: float, size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Take every second of the 2 * size nearest points within the radius: even cover, half the cost."""
+    k = min(2 * size, len(cloud))
+    distance, index = cKDTree(cloud).query(nodes, k=k, distance_upper_bound=radius)
+    distance, index = distance[:, ::2], index[:, ::2]
+    mask = np.isfinite(distance)
+    index = np.where(mask, index, 0)
+    patch = np.concatenate([(cloud[index] - nodes[:, None]) / radius, normals[index]], axis=2)
+    patch[~mask] = 0.0
+    missing = size - patch.shape[1]
+    if missing > 0:
+        patch = np.pad(patch, ((0, 0), (0, missing), (0, 0)))
+        mask = np.pad(mask, ((0, 0), (0, missing)))
+    return patch.astype(np.float32), mask
+
+
+def _with_node_index(cloud: SampledCloud, points: np.ndarray) -> SampledCloud:
+    """Fill in which original point is nearest to each node."""
+    index = cKDTree(points).query(cloud.points)[1]
+    return SampledCloud(
+        cloud.points,
+        cloud.normals,
+        cloud.neighbours,
+        cloud.patches,
+        cloud.patch_masks,
+        cloud.dense,
+        index,
+    )

@@ -1,0 +1,1 @@
+"""What only training needs: losses, labels, the completion decoder, the loop, checkpoints."""

@@ -1,0 +1,131 @@
+"""Settings of a training run, read from TOML; two ship in the package: ``default`` and ``paper``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from utopic_cli.config import ModelConfig, from_dict, to_dict
+from utopic_cli.errors import InputError
+from utopic_cli.training.network import LossWeights
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+OPTIMISERS = ("adamw", "sgd")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long, how fast, on what.
+
+    Attributes:
+        descriptor_pairs: pairs of the first stage (the extractor alone).
+        joint_pairs: pairs of the second stage (the whole network).
+        batch: pairs per step; their gradients are averaged.
+        points: fewest and most points per cloud, drawn anew for every pair.
+        last_points: the same for the last fifth of the joint stage.
+        optimiser: ``adamw`` or ``sgd`` (Nesterov momentum 0.9).
+        descriptor_rate: highest learning rate of the first stage.
+        joint_rate: highest learning rate of the second stage.
+        matching_rate: factor on the rate of the affinity's gain and bias.
+        weight_decay: decoupled weight decay.
+        clip: largest gradient norm.
+        masking_from: share of the joint stage after which random masking starts.
+        average: decay of the running average of the weights, which is what is exported.
+        bfloat16: run the network in bfloat16 where it is safe.
+        checkpoint_seconds: time between checkpoints.
+        validation_pairs: pairs held out for validation.
+        seed: seed of everything random.
+    """
+
+    descriptor_pairs: int = 8000
+    joint_pairs: int = 12000
+    batch: int = 4
+    points: tuple[int, ...] = (400, 900)
+    last_points: tuple[int, ...] = (700, 1024)
+    optimiser: str = "adamw"
+    descriptor_rate: float = 2.5e-3
+    joint_rate: float = 8e-4
+    matching_rate: float = 20.0
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    masking_from: float = 0.67
+    average: float = 0.995
+    bfloat16: bool = True
+    checkpoint_seconds: float = 180.0
+    validation_pairs: int = 48
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Weights of the loss terms."""
+
+    descriptor: float = 0.5
+    registration: float = 1.0
+    coarse: float = 0.5
+    overlap: float = 1.0
+    uncertainty: float = 1.0
+    completion: float = 0.1
+
+    def weights(self) -> LossWeights:
+        """Return the weights by term."""
+        return LossWeights(**to_dict(self))
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training run."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossSettings = field(default_factory=LossSettings)
+    schedule: Schedule = field(default_factory=Schedule)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain data."""
+        return {section: to_dict(getattr(self, section)) for section in ("model", "loss", "schedule")}
+
+
+def training_config_from(values: dict[str, Any], where: str) -> TrainingConfig:
+    """Build a configuration from sections of plain data.
+
+    Raises:
+        InputError: an unknown section or key (the known ones are listed), or a wrong type.
+    """
+    kinds: dict[str, type] = {"model": ModelConfig, "loss": LossSettings, "schedule": Schedule}
+    unknown = sorted(set(values) - set(kinds))
+    if unknown:
+        raise InputError(f"{where}: unknown section {', '.join(unknown)}; known: {', '.join(kinds)}")
+    built = {
+        name: from_dict(kind, values.get(name, {}), f"{where} [{name}]") for name, kind in kinds.items()
+    }
+    return TrainingConfig(**built)
+
+
+def read_training_config(name_or_path: str) -> TrainingConfig:
+    """Read a configuration that ships with the package by name, or any TOML file by path.
+
+    Raises:
+        InputError: no such file or name, no valid TOML, or unknown keys.
+    """
+    folder = Path(__file__).parent / "configs"
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = folder / f"{name_or_path}.toml"
+        if not path.is_file():
+            shipped = ", ".join(sorted(file.stem for file in folder.glob("*.toml")))
+            raise InputError(
+                f"{name_or_path}: no configuration of that name (there are: {shipped}; or give a .toml file)"
+            )
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML ({error})") from error
+    return training_config_from(values, str(path))

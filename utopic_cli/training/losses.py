@@ -1,0 +1,85 @@
+"""The four losses of the paper (Sec. 3.5) and the descriptors' contrastive loss."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_logits
+
+from utopic_cli.model.uncertainty import OverlapDistribution
+from utopic_cli.training.labels import Labels
+
+
+def descriptor_loss(similarity: Tensor, temperature: Tensor, labels: Labels) -> Tensor:
+    """Symmetric InfoNCE within a pair, over the points that have a counterpart.
+
+    Args:
+        similarity: (B, N, M) cosines of unit descriptors.
+        temperature: scalar factor on the cosines.
+        labels: soft positives; ignored entries take no part.
+    """
+    logits = (similarity.float() * temperature).masked_fill(labels.ignored, -1e4)
+    return 0.5 * (
+        _soft_cross_entropy(logits, labels.correspondences)
+        + _soft_cross_entropy(logits.transpose(1, 2), labels.correspondences.transpose(1, 2))
+    )
+
+
+def registration_loss(scores: Tensor, labels: Labels) -> Tensor:
+    """Cross entropy between predicted and known correspondences, per known correspondence.
+
+    Args:
+        scores: (B, N + 1, M + 1) soft correspondences with slack.
+        labels: known answers; near misses are not counted as wrong.
+    """
+    core = scores[:, :-1, :-1].float().clamp(1e-7, 1.0 - 1e-6)
+    right = labels.correspondences
+    wrong = (1.0 - right).masked_fill(labels.ignored, 0.0)
+    terms = right * core.log() + wrong * torch.log1p(-core)
+    return -(terms.sum(dim=(1, 2)) / right.sum(dim=(1, 2)).clamp_min(1.0)).mean()
+
+
+def overlap_loss(source_logits: Tensor, target_logits: Tensor, labels: Labels) -> Tensor:
+    """Binary cross entropy of the overlap scores of both clouds."""
+    return 0.5 * (
+        binary_cross_entropy_with_logits(source_logits, labels.source_overlap)
+        + binary_cross_entropy_with_logits(target_logits, labels.target_overlap)
+    )
+
+
+def uncertainty_loss(distribution: OverlapDistribution, overlap: Tensor, kl_weight: float = 0.1) -> Tensor:
+    """Fit of the sampled overlaps to the known one, and the distance of their Gaussian to N(0, 1).
+
+    The first term makes a confident wrong point expensive, the second keeps the variance
+    from collapsing to zero where it costs nothing.
+
+    Args:
+        distribution: of one cloud, N points and K samples.
+        overlap: (B, N) in {0, 1}.
+        kl_weight: weight of the Kullback-Leibler term relative to the first.
+    """
+    samples = distribution.samples.clamp(1e-6, 1.0 - 1e-6)
+    fit = binary_cross_entropy(samples, overlap[:, None].expand_as(samples))
+    mean, log_variance = distribution.mean, distribution.log_variance
+    divergence = 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance).mean()
+    return 0.5 * fit + kl_weight * divergence
+
+
+def chamfer_loss(predicted: Tensor, expected: Tensor) -> Tensor:
+    """L1 Chamfer distance: mean nearest distance both ways, halved.
+
+    Args:
+        predicted: (B, P, 3).
+        expected: (B, Q, 3).
+    """
+    distance = torch.cdist(predicted, expected)
+    return 0.5 * (distance.min(dim=2).values.mean() + distance.min(dim=1).values.mean())
+
+
+def _soft_cross_entropy(logits: Tensor, targets: Tensor) -> Tensor:
+    """Cross entropy of rows with any target mass, mass normalised to one a row."""
+    mass = targets.sum(dim=2)
+    log_probability = torch.log_softmax(logits, dim=2)
+    per_row = -(targets * log_probability).sum(dim=2) / mass.clamp_min(1e-6)
+    has_target = (mass > 1e-6).float()
+    return (per_row * has_target).sum() / has_target.sum().clamp_min(1.0)

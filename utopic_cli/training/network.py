@@ -1,0 +1,117 @@
+"""The training network: the inference network and what is thrown away after training."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from utopic_cli.config import ModelConfig
+from utopic_cli.model.cloud_input import CloudInput
+from utopic_cli.model.utopic import Utopic
+from utopic_cli.training.completion import CompletionDecoder, canonical_frame
+from utopic_cli.training.labels import Labels, label_pair
+from utopic_cli.training.losses import (
+    chamfer_loss,
+    descriptor_loss,
+    overlap_loss,
+    registration_loss,
+    uncertainty_loss,
+)
+
+
+class TrainingPair(NamedTuple):
+    """A batch of pairs with known answers, in normalised units.
+
+    Attributes:
+        source: (B, N) points each.
+        target: (B, M) points each.
+        gt_T_target_source: (B, 4, 4) float32 between the normalised clouds.
+    """
+
+    source: CloudInput
+    target: CloudInput
+    gt_T_target_source: Tensor
+
+
+class LossWeights(NamedTuple):
+    """Weights of the loss terms; the paper's are 1 except ``descriptor`` and ``coarse`` (0)."""
+
+    descriptor: float
+    registration: float
+    coarse: float
+    overlap: float
+    uncertainty: float
+    completion: float
+
+
+class TrainingNetwork(nn.Module):
+    """Wraps ``Utopic`` with the descriptor temperature, the completion decoder and the losses."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        """Build with random weights."""
+        super().__init__()
+        self.inference = Utopic(config)
+        self.log_temperature = nn.Parameter(torch.tensor(math.log(13.0)))
+        self.completion = CompletionDecoder(config.feature_width)
+        self.in_canonical_frame = config.input_features == "invariant"
+
+    def label(self, pair: TrainingPair) -> Labels:
+        """Label a batch of pairs."""
+        return label_pair(pair.source.points, pair.target.points, pair.gt_T_target_source, pair.source.spacing)
+
+    def descriptor_stage(self, pair: TrainingPair) -> dict[str, Tensor]:
+        """First stage: the extractor alone, by its descriptors. Returns loss terms."""
+        labels = self.label(pair)
+        _, source = self.inference.extractor(pair.source)
+        _, target = self.inference.extractor(pair.target)
+        similarity = source @ target.transpose(1, 2)
+        return {"descriptor": descriptor_loss(similarity, self.log_temperature.exp(), labels)}
+
+    def joint_stage(
+        self, pair: TrainingPair, generator: torch.Generator, masking: bool, completion: bool
+    ) -> dict[str, Tensor]:
+        """Second stage: the whole network. Returns loss terms, not yet weighted."""
+        labels = self.label(pair)
+        prediction = self.inference(pair.source, pair.target, generator=generator, masking=masking)
+        temperature = self.log_temperature.exp()
+        terms = {
+            "descriptor": descriptor_loss(prediction.descriptor_similarity, temperature, labels),
+            "registration": registration_loss(prediction.matching_scores, labels),
+            "coarse": registration_loss(prediction.coarse_scores, labels),
+            "overlap": overlap_loss(
+                prediction.source_overlap_logits, prediction.target_overlap_logits, labels
+            ),
+            "uncertainty": uncertainty_loss(prediction.source_distribution, labels.source_overlap)
+            + uncertainty_loss(prediction.target_distribution, labels.target_overlap),
+        }
+        if completion:
+            terms["completion"] = self._completion_loss(pair, prediction.source_features, forward=True)
+            terms["completion"] = terms["completion"] + self._completion_loss(
+                pair, prediction.target_features, forward=False
+            )
+        return terms
+
+    def _completion_loss(self, pair: TrainingPair, features: Tensor, *, forward: bool) -> Tensor:
+        """Chamfer loss of one cloud's completion against the union of both scans in its frame."""
+        own, other = (pair.source, pair.target) if forward else (pair.target, pair.source)
+        rotation = pair.gt_T_target_source[:, :3, :3]
+        translation = pair.gt_T_target_source[:, None, :3, 3]
+        if forward:
+            moved = (other.points - translation) @ rotation
+        else:
+            moved = other.points @ rotation.transpose(1, 2) + translation
+        whole = torch.cat([own.points, moved], dim=1)
+        if self.in_canonical_frame:
+            centre, axes = canonical_frame(own.points)
+            whole = (whole - centre) @ axes
+        coarse, fine = self.completion(features)
+        return chamfer_loss(coarse.float(), whole) + chamfer_loss(fine.float(), whole)
+
+
+def total_loss(terms: dict[str, Tensor], weights: LossWeights) -> Tensor:
+    """Weigh and add the loss terms that are present."""
+    weighed = weights._asdict()
+    return torch.stack([weighed[name] * term for name, term in terms.items()]).sum()

@@ -1,0 +1,60 @@
+"""Quick validation during training: how good the matches are, without solving for a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from utopic_cli.model.utopic import Utopic
+from utopic_cli.training.labels import POSITIVE_REACH, label_pair
+from utopic_cli.training.network import TrainingPair
+
+
+@torch.no_grad()
+def validate(model: Utopic, pairs: Sequence[TrainingPair], seed: int) -> dict[str, float]:
+    """Measure a network on held-out pairs.
+
+    Returns:
+        ``hit_rate``: share of overlapping source points whose most similar target descriptor
+        lies within reach of the true place; ``match_rate``: the same for the final matching
+        scores; ``inlier_ratio``: share of right ones among the 250 surest matches;
+        ``overlap_accuracy``: share of points whose overlap is told right at 0.5.
+    """
+    model.eval()
+    sums = {"hit_rate": 0.0, "match_rate": 0.0, "inlier_ratio": 0.0, "overlap_accuracy": 0.0}
+    for number, pair in enumerate(pairs):
+        generator = torch.Generator().manual_seed(seed + number)
+        prediction = model(pair.source, pair.target, generator=generator)
+        labels = label_pair(
+            pair.source.points, pair.target.points, pair.gt_T_target_source, pair.source.spacing
+        )
+        error = _match_errors(pair)
+        overlapping = labels.source_overlap[0] > 0.5
+        scores = prediction.matching_scores[0, :-1, :-1]
+        sums["hit_rate"] += _share_within(prediction.descriptor_similarity[0], error, overlapping)
+        sums["match_rate"] += _share_within(scores, error, overlapping)
+        surest = scores.max(dim=1)
+        order = surest.values.argsort(descending=True)[:250]
+        right = error[order, surest.indices[order]] < 2.0 * POSITIVE_REACH
+        sums["inlier_ratio"] += float(right.float().mean())
+        told = torch.cat([prediction.source_overlap[0] > 0.5, prediction.target_overlap[0] > 0.5])
+        known = torch.cat([labels.source_overlap[0] > 0.5, labels.target_overlap[0] > 0.5])
+        sums["overlap_accuracy"] += float((told == known).float().mean())
+    return {name: value / max(len(pairs), 1) for name, value in sums.items()}
+
+
+def _match_errors(pair: TrainingPair) -> Tensor:
+    """Distance of each target node from the true place of each source node, in spacings -> (N, M)."""
+    rotation, translation = pair.gt_T_target_source[0, :3, :3], pair.gt_T_target_source[0, :3, 3]
+    moved = pair.source.points[0] @ rotation.T + translation
+    return torch.cdist(moved, pair.target.points[0]) / pair.source.spacing
+
+
+def _share_within(scores: Tensor, error: Tensor, rows: Tensor) -> float:
+    """Share of the given rows whose best-scored column is within twice the positive reach."""
+    if not bool(rows.any()):
+        return 0.0
+    chosen = scores.argmax(dim=1, keepdim=True)
+    return float((error.gather(1, chosen)[rows, 0] < 2.0 * POSITIVE_REACH).float().mean())
