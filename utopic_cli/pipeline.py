@@ -192,9 +192,7 @@ def _network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
     return model.to(choose_device(device)), card
 
 
-def _solve(
-    prepared: PreparedPair, view: NetworkView, solver: str, initial: np.ndarray | None
-) -> Estimate:
+def _solve(prepared: PreparedPair, view: NetworkView, solver: str, initial: np.ndarray | None) -> Estimate:
     problem = Problem(
         source_nodes=prepared.source.points,
         target_nodes=prepared.target.points,

@@ -120,12 +120,9 @@ def prepare(
         for view, centre in zip((source_viewpoint, target_viewpoint), centres, strict=True)
     ]
     sampled = [
-        sample(part, spacing, points, viewpoint=view)
-        for part, view in zip(thinned, viewpoints, strict=True)
+        sample(part, spacing, points, viewpoint=view) for part, view in zip(thinned, viewpoints, strict=True)
     ]
-    indexed = [
-        _with_node_index(cloud, part / scale) for cloud, part in zip(sampled, centred, strict=True)
-    ]
+    indexed = [_with_node_index(cloud, part / scale) for cloud, part in zip(sampled, centred, strict=True)]
     return PreparedPair(indexed[0], indexed[1], centres[0], centres[1], scale, spacing)
 
 
@@ -215,8 +212,7 @@ def _common_spacing(clouds: list[np.ndarray], most: int) -> float:
     nodes; a sparser cloud has the spacing of its own points. The coarser of the two holds.
     """
     return max(
-        _voxel_size_for(points, most) if len(points) > most else _own_spacing(points)
-        for points in clouds
+        _voxel_size_for(points, most) if len(points) > most else _own_spacing(points) for points in clouds
     )
 
 

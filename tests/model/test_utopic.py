@@ -133,5 +133,3 @@ def test_random_masking_hides_features_only_when_asked_for():
 
     assert torch.equal(scores(False), scores(False))
     assert not torch.equal(scores(False), scores(True))
-
-

@@ -64,7 +64,7 @@ def test_a_card_that_does_not_fit_is_refused(saved, change, message):
 def test_a_missing_card_file_or_name_is_named(saved, tmp_path):
     path, _ = saved
     path.with_suffix(".json").unlink()
-    with pytest.raises(InputError, match="tiny.json: the weights' card can't be read"):
+    with pytest.raises(InputError, match=r"tiny\.json: the weights' card can't be read"):
         load_weights(str(path))
     with pytest.raises(InputError, match="no such weights file"):
         load_weights(str(tmp_path / "absent.safetensors"))

@@ -54,6 +54,8 @@ class AttentionLayer(nn.Module):
 class PositionEncoding(nn.Module):
     """Position added to features: ``absolute`` (fixed sinusoids) or ``learned`` (an MLP) of coordinates."""
 
+    frequencies: Tensor
+
     def __init__(self, width: int, scheme: str) -> None:
         """Build the encoding for ``width`` channels."""
         super().__init__()

@@ -34,10 +34,12 @@ class CloudInput(NamedTuple):
     def to(self, device: torch.device) -> CloudInput:
         """Return the same data on another device."""
         return CloudInput(
-            *(
-                tuple(part.to(device) for part in value) if isinstance(value, tuple) else value.to(device)
-                for value in self
-            )
+            self.points.to(device),
+            self.normals.to(device),
+            self.spacing.to(device),
+            self.neighbours.to(device),
+            tuple(patch.to(device) for patch in self.patches),
+            tuple(mask.to(device) for mask in self.patch_masks),
         )
 
 

@@ -27,7 +27,8 @@ def geometric_embedding(points: Tensor, neighbours: Tensor) -> Tensor:
     distance = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")  # (B, N, N)
 
     triplet = first + second - 2.0 * points
-    along = triplet @ points.transpose(1, 2) - (triplet * points).sum(-1, keepdim=True)  # triplet_i . (p_j - p_i)
+    # triplet_i . (p_j - p_i) without an (N, N, 3) tensor.
+    along = triplet @ points.transpose(1, 2) - (triplet * points).sum(-1, keepdim=True)
     length = triplet.norm(dim=-1, keepdim=True)
     cosine = along / (length * distance).clamp_min(1e-9)
     angle = torch.arccos(cosine.clamp(-1.0, 1.0))

@@ -91,8 +91,8 @@ def load_weights(name_or_path: str) -> tuple[Utopic, dict[str, Any]]:
         tensors = {name: tensor.float() for name, tensor in load_tensors(blob).items()}
         model.load_state_dict(tensors, strict=True)
     except (SafetensorError, RuntimeError) as error:
-        first = str(error).strip().splitlines()
-        raise InputError(f"{path}: not weights of the architecture in its card: {' '.join(first[:2])}") from error
+        reason = " ".join(str(error).strip().splitlines()[:2])
+        raise InputError(f"{path}: not weights of the architecture in its card: {reason}") from error
     return model.eval(), {**card, "name": path.stem, "sha256": digest}
 
 

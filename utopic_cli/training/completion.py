@@ -9,6 +9,8 @@ from torch import Tensor, nn
 class CompletionDecoder(nn.Module):
     """Decode a cloud's pooled features to a coarse cloud, then fold a fine one around it."""
 
+    grid: Tensor
+
     def __init__(self, width: int, coarse: int = 128, folds: int = 4) -> None:
         """Build for features of ``width`` channels; the fine cloud has ``coarse * folds`` points."""
         super().__init__()

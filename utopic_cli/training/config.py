@@ -26,6 +26,7 @@ class Schedule:
     Attributes:
         descriptor_pairs: pairs of the first stage (the extractor alone).
         joint_pairs: pairs of the second stage (the whole network).
+        repeats: how often each synthesised pair is shown.
         batch: pairs per step; their gradients are averaged.
         points: fewest and most points per cloud, drawn anew for every pair.
         last_points: the same for the last fifth of the joint stage.
@@ -40,12 +41,14 @@ class Schedule:
         bfloat16: run the network in bfloat16 where it is safe.
         checkpoint_seconds: time between checkpoints.
         validation_pairs: pairs held out for validation.
+        validation_seconds: time between validations.
         seed: seed of everything random.
     """
 
     descriptor_pairs: int = 8000
     joint_pairs: int = 12000
-    batch: int = 4
+    repeats: int = 2
+    batch: int = 2
     points: tuple[int, ...] = (400, 900)
     last_points: tuple[int, ...] = (700, 1024)
     optimiser: str = "adamw"
@@ -58,7 +61,8 @@ class Schedule:
     average: float = 0.995
     bfloat16: bool = True
     checkpoint_seconds: float = 180.0
-    validation_pairs: int = 48
+    validation_pairs: int = 32
+    validation_seconds: float = 600.0
     seed: int = 1
 
 
@@ -101,7 +105,7 @@ def training_config_from(values: dict[str, Any], where: str) -> TrainingConfig:
     unknown = sorted(set(values) - set(kinds))
     if unknown:
         raise InputError(f"{where}: unknown section {', '.join(unknown)}; known: {', '.join(kinds)}")
-    built = {
+    built: dict[str, Any] = {
         name: from_dict(kind, values.get(name, {}), f"{where} [{name}]") for name, kind in kinds.items()
     }
     return TrainingConfig(**built)

@@ -60,7 +60,8 @@ class TrainingNetwork(nn.Module):
 
     def label(self, pair: TrainingPair) -> Labels:
         """Label a batch of pairs."""
-        return label_pair(pair.source.points, pair.target.points, pair.gt_T_target_source, pair.source.spacing)
+        source, target = pair.source, pair.target
+        return label_pair(source.points, target.points, pair.gt_T_target_source, source.spacing)
 
     def descriptor_stage(self, pair: TrainingPair) -> dict[str, Tensor]:
         """First stage: the extractor alone, by its descriptors. Returns loss terms."""

@@ -22,7 +22,7 @@ from utopic_cli.synthesis.pairs import PairSettings, random_pair
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.training.checkpoint import read_checkpoint, write_checkpoint
 from utopic_cli.training.config import Schedule, TrainingConfig, training_config_from
-from utopic_cli.training.data import PairNumbers, SynthesisedPairs, pair_loader, to_training_pair
+from utopic_cli.training.data import PairKeys, SynthesisedPairs, pair_loader, sample_pair, to_training_pair
 from utopic_cli.training.network import TrainingNetwork, TrainingPair, total_loss
 from utopic_cli.training.validation import validate
 
@@ -106,13 +106,16 @@ def train(
     settings = PairSettings()
     held_out = _validation_pairs(validation_shapes, settings, config)
     pairs = SynthesisedPairs(training_shapes, settings, schedule.seed, config.model.neighbours)
-    numbers = PairNumbers(done, total_pairs(schedule), lambda number: _points_of(number, schedule))
+    keys = PairKeys(
+        done, total_pairs(schedule), schedule.repeats, lambda sample: _points_of(sample, schedule)
+    )
     weights = config.loss.weights()
-    started = last_saved = last_logged = time.monotonic()
+    started = last_saved = last_validated = last_logged = time.monotonic()
     sums: dict[str, float] = {}
-    seen = since_log = 0
+    since_log = 0
+    measured: dict[str, float] = {}
     with _terminated() as stop, open(out / "log.jsonl", "a", encoding="utf-8") as journal:
-        for pair in pair_loader(pairs, numbers, workers):
+        for pair in pair_loader(pairs, keys, workers):
             network.train()
             joint = done >= schedule.descriptor_pairs
             with torch.autocast(device.type, torch.bfloat16, enabled=schedule.bfloat16):
@@ -120,11 +123,11 @@ def train(
                 loss = total_loss(terms, weights) if joint else terms["descriptor"]
             if not bool(torch.isfinite(loss)):
                 raise DivergedError(
-                    f"{out}: the loss is {float(loss)} at pair {done}; the last good checkpoint is "
+                    f"{out}: the loss is {loss.item()} at pair {done}; the last good checkpoint is "
                     f"{checkpoint}. Lower the learning rate in the configuration"
                 )
             (loss / schedule.batch).backward()
-            done, seen, since_log = done + 1, seen + 1, since_log + 1
+            done, since_log = done + 1, since_log + 1
             for name, term in terms.items():
                 sums[name] = sums.get(name, 0.0) + float(term.detach())
             if done % schedule.batch:
@@ -145,10 +148,11 @@ def train(
                 }
                 if last or now - last_saved > schedule.checkpoint_seconds:
                     save()
-                    record.update(
-                        {k: round(v, 4) for k, v in validate(_averaged(config, average), held_out, 0).items()}
-                    )
                     last_saved = time.monotonic()
+                if last or now - last_validated > schedule.validation_seconds:
+                    measured = validate(_averaged(config, average), held_out, schedule.seed)
+                    record.update({name: round(value, 4) for name, value in measured.items()})
+                    last_validated = time.monotonic()
                 journal.write(json.dumps(record) + "\n")
                 journal.flush()
                 if progress is not None:
@@ -161,7 +165,7 @@ def train(
         "wall_clock_s": round(elapsed + time.monotonic() - started, 1),
         "training": config.as_dict(),
         "data": {"shapes": len(training_shapes), "sets": sorted(set(training_shapes.sets.tolist()))},
-        "validation": validate(_averaged(config, average), held_out, 0),
+        "validation": measured,
     }
     return export(_averaged(config, average), card, out)
 
@@ -206,15 +210,16 @@ def _losses(
     )
 
 
-def _points_of(number: int, schedule: Schedule) -> tuple[int, int]:
-    late = number >= schedule.descriptor_pairs + 0.8 * schedule.joint_pairs
+def _points_of(sample: int, schedule: Schedule) -> tuple[int, int]:
+    late = sample >= schedule.descriptor_pairs + 0.8 * schedule.joint_pairs
     fewest, most = schedule.last_points if late else schedule.points
     return fewest, most
 
 
 def _optimiser(network: TrainingNetwork, schedule: Schedule) -> torch.optim.Optimizer:
     """Build the optimiser; the affinity's gains and bias learn faster than the rest."""
-    fast, normal = [], []
+    fast: list[torch.nn.Parameter] = []
+    normal: list[torch.nn.Parameter] = []
     for name, parameter in network.named_parameters():
         is_fast = name.endswith(("matching.gain", "matching.bias", "matching.skip_gain"))
         (fast if is_fast else normal).append(parameter)
@@ -227,9 +232,7 @@ def _optimiser(network: TrainingNetwork, schedule: Schedule) -> torch.optim.Opti
     return torch.optim.AdamW(groups, lr=schedule.joint_rate, betas=(0.9, 0.98))
 
 
-def _step(
-    network: TrainingNetwork, optimiser: torch.optim.Optimizer, schedule: Schedule, done: int
-) -> None:
+def _step(network: TrainingNetwork, optimiser: torch.optim.Optimizer, schedule: Schedule, done: int) -> None:
     rate = learning_rate(schedule, done)
     for group in optimiser.param_groups:
         group["lr"] = rate * group["factor"]
@@ -258,14 +261,11 @@ def _averaged(config: TrainingConfig, average: dict[str, torch.Tensor]) -> Utopi
 def _validation_pairs(
     shapes: ShapeLibrary, settings: PairSettings, config: TrainingConfig
 ) -> list[TrainingPair]:
-    return [
-        to_training_pair(
-            random_pair(shapes, np.random.default_rng([VALIDATION_SEED, number]), settings),
-            768,
-            config.model.neighbours,
-        )
+    made = (
+        random_pair(shapes, np.random.default_rng([VALIDATION_SEED, number]), settings)
         for number in range(config.schedule.validation_pairs)
-    ]
+    )
+    return [to_training_pair(*sample_pair(pair, 768), config.model.neighbours) for pair in made]
 
 
 def _to(pair: TrainingPair, device: torch.device) -> TrainingPair:
