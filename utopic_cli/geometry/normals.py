@@ -32,13 +32,14 @@ def estimate_normals(points: np.ndarray, neighbours: int = 30, radius: float = n
     return _smallest_eigenvector(covariance)
 
 
-def orient_normals(points: np.ndarray, normals: np.ndarray, neighbours: int = 12) -> np.ndarray:
+def orient_normals(points: np.ndarray, normals: np.ndarray, neighbours: int = 16) -> np.ndarray:
     """Make signs agree across the surface, and point away from the centroid on the whole.
 
     Signs are carried along a minimum spanning tree of the neighbour graph whose edges cost
-    least where normals are parallel (so a sign crosses a crease only when it must), then
-    each connected piece is flipped as one so that the sum of n . (p - centroid) is positive.
-    The rule uses nothing but the points, so two scans of one thing get the same signs.
+    least where normals are parallel, so a sign crosses a crease only when it must. Gaps are
+    bridged from the largest pieces, since one view shows all its pieces from the same side.
+    What is still apart is flipped piece by piece so that the sum of n . (p - centroid) is
+    positive. The rule uses nothing but the points, so two scans of one thing agree.
 
     Args:
         points: (N, 3) float64.
@@ -50,14 +51,14 @@ def orient_normals(points: np.ndarray, normals: np.ndarray, neighbours: int = 12
     """
     n = len(points)
     k = min(neighbours + 1, n)
-    _, index = cKDTree(points).query(points, k=k)
-    rows = np.repeat(np.arange(n), k - 1)
-    columns = index[:, 1:].ravel()
+    index = cKDTree(points).query(points, k=k)[1]
+    rows, columns = np.repeat(np.arange(n), k - 1), index[:, 1:].ravel()
+    bridge_rows, bridge_columns = _bridges(points, rows, columns)
+    rows, columns = np.concatenate([rows, bridge_rows]), np.concatenate([columns, bridge_columns])
     agreement = np.einsum("nd,nd->n", normals[rows], normals[columns])
     cost = 1.0 - np.abs(agreement) + 1e-6  # a stored zero would read as "no edge"
     graph = csr_matrix((cost, (rows, columns)), shape=(n, n))
-    graph = graph.maximum(graph.T)
-    tree = minimum_spanning_tree(graph)
+    tree = minimum_spanning_tree(graph.maximum(graph.T))
     tree = tree + tree.T
     pieces, piece = connected_components(tree, directed=False)
     parent = np.arange(n)
@@ -74,6 +75,24 @@ def orient_normals(points: np.ndarray, normals: np.ndarray, neighbours: int = 12
         piece, np.einsum("nd,nd->n", oriented, points - points.mean(axis=0)), minlength=pieces
     )
     return oriented * np.where(outward < 0, -1.0, 1.0)[piece][:, None]
+
+
+def _bridges(
+    points: np.ndarray, rows: np.ndarray, columns: np.ndarray, most: int = 32, width: int = 8
+) -> tuple[np.ndarray, np.ndarray]:
+    """Join each of the largest pieces of a graph to the rest at the ``width`` narrowest gaps."""
+    n = len(points)
+    graph = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    pieces, piece = connected_components(graph, directed=False)
+    bridges: list[np.ndarray] = [np.empty((2, 0), dtype=np.int64)]
+    if pieces > 1:
+        for number in np.argsort(-np.bincount(piece), kind="stable")[:most]:
+            inside, outside = np.flatnonzero(piece == number), np.flatnonzero(piece != number)
+            gap, nearest = cKDTree(points[outside]).query(points[inside])
+            narrowest = np.argsort(gap, kind="stable")[:width]
+            bridges.append(np.stack([inside[narrowest], outside[nearest[narrowest]]]))
+    joined = np.concatenate(bridges, axis=1)
+    return joined[0], joined[1]
 
 
 def orient_towards(points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:

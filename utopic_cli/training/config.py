@@ -38,7 +38,7 @@ class Schedule:
         clip: largest gradient norm.
         masking_from: share of the joint stage after which random masking starts.
         average: decay of the running average of the weights, which is what is exported.
-        bfloat16: run the network in bfloat16 where it is safe.
+        bfloat16: on a GPU, run the network in bfloat16 (losses and Sinkhorn stay float32).
         checkpoint_seconds: time between checkpoints.
         validation_pairs: pairs held out for validation.
         validation_seconds: time between validations.

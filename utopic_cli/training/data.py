@@ -23,9 +23,28 @@ if TYPE_CHECKING:
     from utopic_cli.synthesis.shapes import ShapeLibrary
 
 
-def sample_pair(pair: ScanPair, points: int) -> tuple[PreparedPair, np.ndarray]:
-    """Sample a pair for the network, and take its known answer to normalised units."""
-    prepared = prepare(pair.source, pair.target, points)
+FAR = 1e3
+"""Distance of a scanner at infinity, in extents."""
+
+
+def sample_pair(pair: ScanPair, points: int, known_views: bool = False) -> tuple[PreparedPair, np.ndarray]:
+    """Sample a pair for the network, and take its known answer to normalised units.
+
+    With ``known_views`` normals face the scanner where it is known, which is always right;
+    without, their signs are found from the points alone, as at inference, with its mistakes.
+    """
+    views = {}
+    if known_views:
+        views = {
+            f"{name}_viewpoint": None
+            if view is None
+            else cloud.points.mean(axis=0) + FAR * pair.extent * view
+            for name, cloud, view in (
+                ("source", pair.source, pair.source_viewpoint),
+                ("target", pair.target, pair.target_viewpoint),
+            )
+        }
+    prepared = prepare(pair.source, pair.target, points, **views)
     return prepared, prepared.normalise(pair.gt_T_target_source)
 
 
@@ -61,7 +80,7 @@ class SynthesisedPairs(Dataset[TrainingPair]):
             rng = np.random.default_rng([self.seed, number])
             points = int(rng.integers(fewest, most + 1))
             pair = random_pair(self.library, rng, self.settings)
-            self._made[key] = sample_pair(pair, points)
+            self._made[key] = sample_pair(pair, points, known_views=rng.random() < 0.5)
             if len(self._made) > BLOCK:
                 self._made.popitem(last=False)
         return to_training_pair(*self._made[key], self.neighbours)

@@ -1,0 +1,236 @@
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from utopic_cli.commands import outputs
+
+HEADER = (
+    "ply\nformat ascii 1.0\nelement vertex {}\n"
+    "property float x\nproperty float y\nproperty float z\nend_header\n"
+)
+BIG_HEADER = HEADER.format(4_000_000_000).replace("ascii", "binary_little_endian")
+
+
+def ply(points):
+    return HEADER.format(len(points)) + "".join(f"{x} {y} {z}\n" for x, y, z in points)
+
+
+def grid(count):
+    return [(i % 7, i // 7, i % 5) for i in range(count)]
+
+
+BAD_FILES = {
+    "empty": b"",
+    "garbage": bytes(range(256)) * 8,
+    "not a scan": b"dear sir or madam\n",
+    "truncated": ply(grid(80)).encode()[:-200],
+    "promises 4 billion": BIG_HEADER.encode() + b"\0" * 99,
+    "too few points": ply(grid(49)).encode(),
+    "too few distinct points": ply(grid(40) * 3).encode(),
+    "all equal": ply([(1, 2, 3)] * 90).encode(),
+    "on a line": ply([(i, 2 * i, -i) for i in range(90)]).encode(),
+    "all NaN": ply([("nan", "nan", "nan")] * 90).encode(),
+}
+
+
+def snapshot(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def assert_one_line(result, *words):
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("utopic: ")
+    for word in words:
+        assert word in lines[0]
+
+
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("kind", BAD_FILES)
+def test_a_scan_that_cant_be_used_exits_4_in_one_line_and_leaves_everything_as_it_was(
+    cli, fake, scans, tmp_path, kind, side
+):
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(BAD_FILES[kind])
+    (tmp_path / "T.txt").write_text("precious")
+    before = snapshot(tmp_path)
+    pair = [bad, scans[1]] if side == 0 else [scans[0], bad]
+    result = cli("align", *pair, "-o", tmp_path / "T.txt", "--out-dir", tmp_path / "out", "--overwrite")
+    assert result.exit_code == 4, result.output
+    assert_one_line(result, str(bad))
+    assert result.stdout == ""
+    assert not fake.calls
+    assert snapshot(tmp_path) == before
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "fifo", "unknown suffix", "below a file"])
+def test_what_is_not_a_scan_file_exits_4(cli, fake, scans, tmp_path, kind):
+    path = tmp_path / "bad.ply"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "unknown suffix":
+        path = tmp_path / "bad.docx"
+        path.write_bytes(scans[0].read_bytes()[3:])
+    elif kind == "below a file":
+        path = scans[0] / "bad.ply"
+    result = cli("align", path, scans[1])
+    assert result.exit_code == 4, result.output
+    assert_one_line(result, str(path))
+
+
+@pytest.mark.parametrize("content", ["", "1 2 3", "not numbers", "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n"])
+def test_an_initial_transformation_that_is_none_exits_4(cli, fake, scans, tmp_path, content):
+    (tmp_path / "init.txt").write_text(content)
+    result = cli("align", *scans, "--init", tmp_path / "init.txt")
+    assert result.exit_code == 4
+    assert_one_line(result, "init.txt")
+
+
+OUTPUT_OPTIONS = {
+    "-o": "T.txt", "--aligned": "moved.ply", "--merged": "m.ply", "--report": "r.json",
+    "--clouds": "clouds", "--out-dir": "out",
+}  # fmt: skip
+
+
+@pytest.fixture
+def no_reading(monkeypatch):
+    """Fail if a scan is read: outputs are checked before any work."""
+
+    def refuse(path, **_):
+        raise AssertionError(f"{path} was read before the outputs were checked")
+
+    monkeypatch.setattr("utopic_cli.io.scan.read_scan", refuse)
+
+
+@pytest.mark.parametrize("option", OUTPUT_OPTIONS)
+@pytest.mark.parametrize("place", ["missing folder", "below a file"])
+def test_an_output_that_cant_be_written_exits_5_before_any_work(
+    cli, fake, scans, tmp_path, no_reading, option, place
+):
+    folder = tmp_path / "missing" / "deeper" if place == "missing folder" else scans[0]
+    result = cli("align", *scans, option, folder / OUTPUT_OPTIONS[option])
+    assert result.exit_code == 5, result.output
+    assert_one_line(result, str(folder))
+
+
+@pytest.mark.parametrize("option", OUTPUT_OPTIONS)
+def test_existing_files_are_refused_and_with_overwrite_replaced(cli, fake, scans, tmp_path, option):
+    path = tmp_path / OUTPUT_OPTIONS[option]
+    first = cli("align", *scans, option, path)
+    assert first.exit_code == 0, first.output
+    before = snapshot(tmp_path)
+    again = cli("align", *scans, option, path)
+    assert again.exit_code == 5, again.output
+    assert_one_line(again, "--overwrite")
+    assert len(fake.calls) == 1
+    assert snapshot(tmp_path) == before
+    assert cli("align", *scans, option, path, "--overwrite").exit_code == 0
+
+
+@pytest.mark.parametrize("link", ["same name", "hard link", "symbolic link"])
+def test_an_input_is_never_overwritten(cli, fake, scans, tmp_path, no_reading, link):
+    output = scans[0] if link == "same name" else tmp_path / "link.ply"
+    if link == "hard link":
+        os.link(scans[0], output)
+    elif link == "symbolic link":
+        output.symlink_to(scans[0])
+    before = scans[0].read_bytes()
+    result = cli("align", *scans, "--aligned", output, "--overwrite")
+    assert result.exit_code == 5
+    assert_one_line(result, str(output), "input")
+    assert scans[0].read_bytes() == before
+
+
+def test_one_file_for_two_outputs_is_refused(cli, fake, scans, tmp_path, no_reading):
+    result = cli("align", *scans, "--aligned", tmp_path / "x.ply", "--merged", tmp_path / "." / "x.ply")
+    assert result.exit_code == 5
+    assert_one_line(result, "two outputs")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["-o", "T.xml"],
+        ["-o", "T"],
+        ["--aligned", "moved.pcd"],
+        ["--merged", "merged.obj"],
+        ["--points", "1"],
+        ["--points", "many"],
+        ["--solver", "magic"],
+        ["--device", "abacus"],
+        ["--threads", "-1"],
+        ["--no-such-option"],
+        ["third.ply"],
+    ],
+)
+def test_bad_options_exit_2(cli, fake, scans, tmp_path, no_reading, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    before = snapshot(tmp_path)
+    assert cli("align", *scans, *arguments).exit_code == 2
+    assert snapshot(tmp_path) == before
+
+
+def test_when_one_file_cant_be_written_the_new_ones_go_again(cli, fake, scans, tmp_path, monkeypatch):
+    from utopic_cli.errors import OutputError
+    from utopic_cli.io import output
+
+    write = output.write_atomically
+
+    def full_disk(path, data, *, overwrite):
+        if path.name == "source_uncertainty.ply":
+            raise OutputError(f"{path}: No space left on device")
+        return write(path, data, overwrite=overwrite)
+
+    monkeypatch.setattr(output, "write_atomically", full_disk)
+    before = snapshot(tmp_path)
+    result = cli("align", *scans, "--out-dir", tmp_path / "out", "-o", tmp_path / "T.txt")
+    assert result.exit_code == 5
+    assert_one_line(result, "source_uncertainty.ply", "No space left")
+    assert snapshot(tmp_path) == before
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bug_of_ours_is_one_line_and_exit_1_and_debug_shows_where(cli, fake, scans):
+    fake.raises = ValueError("first line\nsecond line")
+    result = cli("align", *scans)
+    assert result.exit_code == 1
+    assert_one_line(result, "ValueError: first line second line", "bug", "--debug")
+    with_traceback = cli("align", *scans, "--debug")
+    assert with_traceback.exit_code == 1
+    assert "Traceback" in with_traceback.stderr
+    assert "conftest.py" in with_traceback.stderr
+
+
+def test_an_interrupt_exits_130_and_leaves_nothing(cli, fake, scans, tmp_path):
+    fake.raises = KeyboardInterrupt()
+    result = cli("align", *scans, "--out-dir", tmp_path / "out")
+    assert result.exit_code == 130
+    assert_one_line(result, "interrupted")
+    assert not (tmp_path / "out").exists()
+
+
+def test_identity_sees_through_names(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real" / "a.txt").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    same = outputs._identity(tmp_path / "real" / "a.txt")
+    assert outputs._identity(tmp_path / "link" / "a.txt") == same
+    new = outputs._identity(tmp_path / "real" / "new.txt")
+    assert outputs._identity(tmp_path / "link" / "new.txt") == new != same
+
+
+def test_points_with_nan_are_dropped_and_said(cli, fake, tmp_path):
+    rng = np.random.default_rng(1)
+    points = [tuple(row) for row in rng.standard_normal((70, 3)).round(3).tolist()]
+    for name in ("a.ply", "b.ply"):
+        (tmp_path / name).write_text(ply([*points, ("nan", "nan", "nan")]))
+    result = cli("align", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert result.exit_code == 0, result.stderr
+    assert len(fake.calls[0]["source"]) == 70
+    assert "warning" in result.stderr

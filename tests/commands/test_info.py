@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import hashlib
+import json
+
+import utopic_cli
+from utopic_cli.commands import info
+from utopic_cli.model.weights import bundled_weights
+
+
+def test_info_says_versions_devices_and_the_weights_hash(cli, monkeypatch):
+    monkeypatch.setattr(info, "OPTIONAL", {})  # importing open3d takes seconds
+    result = cli("info", "--json")
+    assert result.exit_code == 0
+    facts = json.loads(result.stdout)
+    assert facts["versions"]["utopic-cli"] == utopic_cli.__version__
+    assert facts["versions"]["torch"][0].isdigit()
+    assert "cpu" in facts["devices"]
+    for name, path in bundled_weights().items():
+        assert facts["weights"][name]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert facts["weights"][name]["intact"] is True
+    text = cli("info").stdout
+    assert text.startswith("versions")
+    assert all(entry["sha256"] in text for entry in facts["weights"].values())
+
+
+def test_a_damaged_weights_file_is_called_so(cli, monkeypatch, tmp_path):
+    (tmp_path / "broken.safetensors").write_bytes(b"not what the card says")
+    (tmp_path / "broken.json").write_text(json.dumps({"model": {}, "sha256": "0" * 64}))
+    (tmp_path / "lonely.safetensors").write_bytes(b"without a card")
+    found = {name: tmp_path / f"{name}.safetensors" for name in ("broken", "lonely")}
+    monkeypatch.setattr("utopic_cli.model.weights.bundled_weights", lambda: found)
+    monkeypatch.setattr(info, "OPTIONAL", {})
+    weights = json.loads(cli("info", "--json").stdout)["weights"]
+    assert weights["broken"]["intact"] is False
+    assert "lonely.json" in weights["lonely"]["card"]
+
+
+def test_an_optional_part_that_is_missing_or_broken_says_what_to_do(monkeypatch):
+    def broken(name):
+        raise OSError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.setattr(info, "_version", lambda name: "1.0")
+    monkeypatch.setattr("importlib.import_module", broken)
+    assert "libusb-1.0.so.0" in info._optional("open3d")
+    assert "apt-get install" in info._optional("open3d")
+    monkeypatch.setattr(info, "_version", lambda name: "not installed")
+    assert "pip install" in info._optional("tensorboard")

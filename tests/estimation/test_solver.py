@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.estimation.conftest import VOXEL, make_problem
+from utopic_cli.estimation.solver import Estimate, Problem, solve
+from utopic_cli.geometry import rigid
+from utopic_cli.point_cloud import PointCloud
+
+
+@pytest.fixture(scope="module")
+def hard_problem(scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray) -> Problem:
+    return make_problem(*scans, gt_transformation, wrong=0.85)
+
+
+@pytest.fixture(scope="module")
+def automatic(hard_problem: Problem) -> Estimate:
+    return solve(hard_problem)
+
+
+def assert_right(T: np.ndarray, gt: np.ndarray, degrees: float = 1.0, distance: float = VOXEL / 2) -> None:
+    assert rigid.relative_rotation_error_deg(T, gt) < degrees
+    assert rigid.relative_translation_error(T, gt) < distance
+    assert rigid.is_rigid(T, 1e-9)
+
+
+@pytest.mark.parametrize("solver", ["auto", "consensus"])
+def test_solves_a_pair_with_mostly_wrong_scores(
+    hard_problem: Problem, automatic: Estimate, gt_transformation: np.ndarray, solver: str
+) -> None:
+    estimate = automatic if solver == "auto" else solve(hard_problem, solver)
+    assert_right(estimate.T_target_source, gt_transformation)
+    assert estimate.score == pytest.approx(estimate.fit - estimate.violation)
+    assert all(rival.score <= estimate.score for rival in estimate.rivals)
+    assert 0 < estimate.support < 1
+    pairs = estimate.correspondences
+    moved = rigid.apply(estimate.T_target_source, hard_problem.source_nodes[pairs.source_indices])
+    apart = np.linalg.norm(moved - hard_problem.target_nodes[pairs.target_indices], axis=1)
+    assert len(pairs) > 3 and apart.max() <= 2.6 * VOXEL
+
+
+def test_svd_is_the_papers_solver_and_nothing_more(
+    scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray
+) -> None:
+    easy = make_problem(*scans, gt_transformation, wrong=0.0)
+    estimate = solve(easy, "svd")
+    assert estimate.method == "svd" and estimate.hypotheses == 1 and not estimate.rivals
+    assert estimate.correspondences.weights.sum() == pytest.approx(1.0)
+    assert_right(estimate.T_target_source, gt_transformation, degrees=25.0, distance=0.5)
+
+
+def test_an_initial_transformation_decides_where_the_scores_say_nothing(
+    hard_problem: Problem, gt_transformation: np.ndarray
+) -> None:
+    rng = np.random.default_rng(0)
+    noise = replace(hard_problem, matching_scores=0.01 * rng.random(hard_problem.matching_scores.shape))
+    turn = rigid.rigid(rigid.nearest_rotation(np.eye(3) + rng.normal(0, 0.03, (3, 3))), np.full(3, 0.01))
+    estimate = solve(noise, "auto", initial=gt_transformation @ turn)
+    assert estimate.method == "initial"
+    assert_right(estimate.T_target_source, gt_transformation)
+
+
+def test_same_input_same_bits(hard_problem: Problem, automatic: Estimate) -> None:
+    first, second = automatic, solve(hard_problem)
+    assert np.array_equal(first.T_target_source, second.T_target_source)
+    assert first.score == second.score and len(first.rivals) == len(second.rivals)
+
+
+def test_swapping_source_and_target_inverts(hard_problem: Problem, automatic: Estimate) -> None:
+    p = hard_problem
+    swapped = Problem(
+        p.target_nodes,
+        p.source_nodes,
+        p.matching_scores.T,
+        p.target_overlap,
+        p.source_overlap,
+        p.target_certainty,
+        p.source_certainty,
+        p.target_dense,
+        p.source_dense,
+        p.spacing,
+    )
+    there, back = automatic.T_target_source, solve(swapped).T_target_source
+    assert_right(back @ there, np.eye(4), degrees=0.7)
+
+
+def test_nothing_depends_on_the_unit(hard_problem: Problem, automatic: Estimate) -> None:
+    p, scale = hard_problem, 1e3
+    scaled = replace(
+        p,
+        source_nodes=p.source_nodes * scale,
+        target_nodes=p.target_nodes * scale,
+        source_dense=replace(p.source_dense, points=p.source_dense.points * scale),
+        target_dense=replace(p.target_dense, points=p.target_dense.points * scale),
+        spacing=p.spacing * scale,
+    )
+    one, other = automatic.T_target_source, solve(scaled).T_target_source
+    assert np.abs(one[:3, :3] - other[:3, :3]).max() < 1e-3
+    assert np.abs(one[:3, 3] * scale - other[:3, 3]).max() < 1e-3 * scale
+
+
+def test_input_that_fits_no_problem_is_refused(hard_problem: Problem) -> None:
+    with pytest.raises(ValueError, match="unknown solver"):
+        solve(hard_problem, "ransac")
+    with pytest.raises(ValueError, match="shape"):
+        solve(replace(hard_problem, matching_scores=np.ones((3, 3))))
+    with pytest.raises(ValueError, match="source_overlap"):
+        solve(replace(hard_problem, source_overlap=np.ones(2)))
+    with pytest.raises(ValueError, match="spacing"):
+        solve(replace(hard_problem, spacing=0.0))
+    with pytest.raises(ValueError, match="not rigid"):
+        solve(hard_problem, initial=np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="no transformation"):
+        solve(replace(hard_problem, matching_scores=np.zeros_like(hard_problem.matching_scores)))

@@ -1,0 +1,108 @@
+"""The roof: mounts the commands, and is the one door through which errors leave.
+
+Everything heavy is imported inside the commands, so that ``--help`` is instant.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from utopic_cli import __version__
+from utopic_cli.commands.align import align
+from utopic_cli.commands.bench import bench
+from utopic_cli.commands.console import debug_wanted
+from utopic_cli.commands.demo import demo
+from utopic_cli.commands.info import info
+from utopic_cli.commands.train import train
+from utopic_cli.errors import UtopicError
+
+# Usage errors are Typer's own to print. Their base class has moved between Typer's versions
+# (click, then a copy of it), so it is taken from a class that is exported by all of them.
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
+_PASSED_ON = (typer.Exit, typer.Abort, _USAGE_ERROR, BrokenPipeError)
+
+
+class Door(TyperGroup):
+    """A command group that turns every exception into one line on stderr and an exit code.
+
+    It stands here and not around ``main`` so that a shell and Typer's ``CliRunner`` see the same.
+    """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command; see the README for the exit codes."""
+        try:
+            return super().invoke(ctx)
+        except _PASSED_ON:
+            raise
+        except KeyboardInterrupt:
+            _leave(ctx, "interrupted", 130)
+        except UtopicError as error:
+            _leave(ctx, f"error: {_one_line(error)}", error.exit_code)
+        except Exception as error:
+            what = f"{type(error).__name__}: {_one_line(error)}".rstrip(": ")
+            _leave(ctx, f"error: unexpected {what}; this is a bug, run with --debug for the traceback", 1)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).splitlines())
+
+
+def _leave(ctx: Any, message: str, exit_code: int) -> None:
+    if debug_wanted(ctx):
+        traceback.print_exc(file=sys.stderr)
+    typer.echo(f"utopic: {message}", err=True)
+    raise typer.Exit(exit_code)
+
+
+app = typer.Typer(
+    cls=Door,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit codes: 0 aligned; 1 a bug of ours; 2 usage; 3 aligned, do not trust it; "
+    "4 an input can't be used; 5 an output can't be written; 130 interrupted.",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"utopic-cli {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def roof(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
+    ] = False,
+) -> None:
+    """Align overlapping 3D scans: two files in, one transformation out.
+
+    [bold]p_target = T_target_source @ p_source[/bold]
+
+    SOURCE is the scan that moves and is named first, TARGET stays.
+    Scans come in any unit, any pose and any density.
+    """
+
+
+app.command()(align)
+app.command()(demo)
+app.command()(info)
+app.command()(train)
+app.add_typer(bench, name="bench")
+
+
+def main() -> None:
+    """Entry point of the ``utopic`` command."""
+    app(prog_name="utopic")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The commands: options in, a library call, files and a summary out."""

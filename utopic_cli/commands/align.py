@@ -1,0 +1,277 @@
+"""``utopic align``: two scan files in, one transformation and what else was asked for out."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from utopic_cli.commands.console import (
+    SOLVING,
+    Console,
+    Debug,
+    Device,
+    Overwrite,
+    Quiet,
+    Seed,
+    Threads,
+    Verbose,
+    Weights,
+    stopwatch,
+)
+from utopic_cli.commands.outputs import OutputPlan, check_outputs, make_outputs, plan_outputs, write_outputs
+from utopic_cli.config import AlignOptions
+from utopic_cli.errors import OutputError
+
+if TYPE_CHECKING:
+    from utopic_cli.io.scan import Scan
+    from utopic_cli.result import RegistrationResult
+
+_OUTPUTS = "What to write"
+_DEFAULTS = AlignOptions()
+
+NOT_TRUSTED = 3
+
+
+def align(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="The scan that moves.")],
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="The scan that stays.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PATH",
+            help="The transformation: .txt (4x4, row-major), .npy or .json. Without this and --out-dir "
+            "it goes to stdout.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None,
+    out_dir: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="The whole set: transformation.txt, the aligned scan, four coloured PLYs, report.json.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None,
+    aligned: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="SOURCE moved onto TARGET, in its own format with every attribute kept.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None,
+    merged: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="Both scans in the target's frame as one PLY; the field 'scan' says which is which.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None,
+    clouds: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="The four coloured PLYs: redder = more likely overlapping, more uncertain.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="The JSON report.", rich_help_panel=_OUTPUTS)
+    ] = None,
+    json_report: Annotated[
+        bool,
+        typer.Option("--json", help="The JSON report alone on stdout.", rich_help_panel=_OUTPUTS),
+    ] = False,
+    overwrite: Overwrite = False,
+    init: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="A transformation to try first (.txt, .npy or .json).",
+            rich_help_panel=SOLVING,
+        ),
+    ] = None,
+    points: Annotated[
+        int,
+        typer.Option(min=50, help="Most points per scan the network sees.", rich_help_panel=SOLVING),
+    ] = _DEFAULTS.points,
+    refine: Annotated[
+        bool,
+        typer.Option(help="Refine at full resolution after the network's estimate.", rich_help_panel=SOLVING),
+    ] = _DEFAULTS.refine,
+    solver: Annotated[
+        Literal["auto", "svd", "consensus"],
+        typer.Option(
+            help="svd: the paper's, overlap-weighted Procrustes; auto chooses by verification.",
+            rich_help_panel=SOLVING,
+        ),
+    ] = "auto",
+    weights: Weights = _DEFAULTS.weights,
+    device: Device = "auto",
+    threads: Threads = _DEFAULTS.threads,
+    seed: Seed = _DEFAULTS.seed,
+    exit_zero: Annotated[
+        bool,
+        typer.Option("--exit-zero", help="Exit with 0 even if the answer is not to be trusted."),
+    ] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Find the transformation that moves SOURCE onto TARGET.
+
+    [bold]p_target = T_target_source @ p_source[/bold]
+
+    Reads PLY, PCD, OBJ, XYZ/TXT/PTS, STL, OFF and GLB.
+    No unit, voxel size or radius is needed.
+    Nothing existing is replaced without --overwrite.
+    """
+    request = AlignRequest(
+        source=source,
+        target=target,
+        plan=plan_outputs(
+            source,
+            output=output,
+            out_dir=out_dir,
+            aligned=aligned,
+            merged=merged,
+            clouds=clouds,
+            report=report,
+        ),
+        options=AlignOptions(
+            weights=weights,
+            points=points,
+            refine=refine,
+            solver=solver,
+            device=device,
+            threads=threads,
+            seed=seed,
+        ),
+        init=init,
+        overwrite=overwrite,
+    )
+    outcome = run(request, Console(quiet=quiet, verbose=verbose))
+    if json_report:
+        from utopic_cli.report import report_bytes
+
+        _to_stdout(report_bytes(outcome.report))
+    elif output is None and out_dir is None:
+        from utopic_cli.io.transformation import format_transformation
+
+        _to_stdout(format_transformation(outcome.result.T_target_source, ".txt"))
+    if outcome.result.trusted is False and not exit_zero:
+        raise typer.Exit(NOT_TRUSTED)
+
+
+@dataclass(frozen=True)
+class AlignRequest:
+    """One alignment as asked for.
+
+    Attributes:
+        source: path of the scan that moves.
+        target: path of the scan that stays.
+        plan: the files to write.
+        options: the pipeline's options.
+        init: path of a transformation to try first.
+        overwrite: whether existing files may be replaced.
+    """
+
+    source: Path
+    target: Path
+    plan: OutputPlan
+    options: AlignOptions
+    init: Path | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class AlignOutcome:
+    """What one alignment gave: the scans as read, the answer, and its report."""
+
+    source: Scan
+    target: Scan
+    result: RegistrationResult
+    report: dict[str, Any]
+
+
+def run(request: AlignRequest, console: Console) -> AlignOutcome:
+    """Check the outputs, read both scans, register, write, and say what came out on stderr.
+
+    Raises:
+        OutputError: an output can't be written; found before any work wherever that can be known.
+        InputError: a scan, the initial transformation or the weights can't be used.
+    """
+    inputs = [request.source, request.target, Path(request.options.weights)]
+    check_outputs(request.plan, [*inputs, *([request.init] if request.init else [])], request.overwrite)
+    with console.progress() as progress:
+        progress("loading libraries")
+        from utopic_cli import pipeline
+        from utopic_cli.io.scan import read_scan
+        from utopic_cli.io.transformation import read_transformation
+        from utopic_cli.report import build_report, report_bytes
+
+        timings_s: dict[str, float] = {}
+        with stopwatch(timings_s, "read"):
+            progress(f"reading {request.source.name}")
+            source = read_scan(request.source, seed=request.options.seed)
+            progress(f"reading {request.target.name}")
+            target = read_scan(request.target, seed=request.options.seed)
+            initial = read_transformation(request.init) if request.init else None
+        result = pipeline.register(
+            source.cloud, target.cloud, request.options, initial=initial, progress=progress
+        )
+        progress("writing")
+        report = build_report(source, target, result, timings_s)
+        contents = make_outputs(request.plan, source, target, result, report_bytes(report))
+        write_outputs(request.plan, contents, request.overwrite)
+    outcome = AlignOutcome(source, target, result, report)
+    _say_summary(outcome, request.plan, console)
+    return outcome
+
+
+def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> None:
+    """Say the verdict, what it rests on, the motion, and the files written."""
+    report = outcome.report
+    console.warnings(tuple(report["warnings"]))
+    console.line(f"{outcome.source.path} -> {outcome.target.path}: {_verdict(outcome.result)}")
+    for reason in outcome.result.reasons:
+        console.line(f"  {'because':<9}{reason}")
+    fit = outcome.result.fit
+    source, target = fit.overlap_ratio["source"], fit.overlap_ratio["target"]
+    console.line(f"  {'overlap':<9}{source:.0%} of the source, {target:.0%} of the target")
+    console.line(f"  {'residual':<9}{fit.inlier_rmse:.4g} file units rms where they overlap")
+    motion = report["about_source_centroid"]
+    shift = math.hypot(*motion["translation"])
+    angle = f"{motion['angle_deg']:.3f} degrees about the source's centroid"
+    console.line(f"  {'motion':<9}{angle}, which moves by {shift:.6g} file units")
+    for step, seconds in report["timings_s"].items():
+        console.detail(f"  {'time':<9}{step} {seconds:.2f} s")
+    if outcome.result.weights_name:
+        console.detail(f"  {'weights':<9}{outcome.result.weights_name} {outcome.result.weights_sha256[:12]}")
+    for path in plan.paths:
+        console.line(f"  {'wrote':<9}{path}")
+
+
+def _verdict(result: RegistrationResult) -> str:
+    if result.confidence is None:
+        return "aligned; no calibrated verdict in this version"
+    verdict = "aligned" if result.trusted else "aligned, but do not trust it"
+    return f"{verdict}; confidence {result.confidence:.0%}"
+
+
+def _to_stdout(data: bytes) -> None:
+    try:
+        sys.stdout.write(data.decode("ascii"))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"stdout: can't be written: {error.strerror}") from error

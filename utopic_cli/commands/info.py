@@ -1,0 +1,105 @@
+"""``utopic info``: versions, devices, the bundled weights, optional parts."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from utopic_cli.commands.console import Debug
+
+REQUIRED = ("torch", "numpy", "scipy", "safetensors", "small_gicp", "trimesh", "typer", "rich")
+OPTIONAL = {
+    "open3d": "baselines of 'utopic bench'; needs system libraries: "
+    "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1",
+    "tensorboard": "curves of 'utopic train'; pip install 'utopic-cli[train]'",
+}
+
+
+def info(
+    json_report: Annotated[bool, typer.Option("--json", help="As JSON on stdout.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Print versions, devices, the bundled weights with their hash, and what optional parts are there."""
+    facts = collect()
+    if json_report:
+        import json
+
+        typer.echo(json.dumps(facts, indent=2, allow_nan=False))
+        return
+    for section, entries in facts.items():
+        typer.echo(section)
+        for name, value in entries.items():
+            typer.echo(f"  {name:<14} {value if not isinstance(value, dict) else _lines(value)}")
+
+
+def collect() -> dict[str, dict[str, Any]]:
+    """Gather what ``info`` prints, as JSON-ready data by section."""
+    import platform
+
+    import torch
+
+    from utopic_cli import __version__
+
+    versions = {"utopic-cli": __version__, "python": platform.python_version()}
+    versions["platform"] = platform.platform()
+    devices = {"cpu": f"{torch.get_num_threads()} threads"}
+    if torch.cuda.is_available():
+        devices["cuda"] = torch.cuda.get_device_name()
+    if torch.backends.mps.is_available():
+        devices["mps"] = "available"
+    return {
+        "versions": versions | {name: _version(name) for name in REQUIRED},
+        "devices": devices,
+        "weights": _weights(),
+        "optional": {name: _optional(name) for name in OPTIONAL},
+    }
+
+
+def _version(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _optional(name: str) -> str:
+    """Import an optional part to see that it loads: open3d may be installed and still not work."""
+    from importlib import import_module
+
+    version = _version(name)
+    if version == "not installed":
+        return f"{version} ({OPTIONAL[name]})"
+    try:
+        import_module(name)
+    except (ImportError, OSError) as error:
+        return f"{version}, can't be loaded: {' '.join(str(error).split())} ({OPTIONAL[name]})"
+    return version
+
+
+def _weights() -> dict[str, Any]:
+    import hashlib
+
+    from utopic_cli.errors import InputError
+    from utopic_cli.model.weights import bundled_weights, read_card
+
+    found: dict[str, Any] = {}
+    for name, path in bundled_weights().items():
+        facts: dict[str, Any] = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        try:
+            card = read_card(path)
+            facts |= {key: value for key, value in card.items() if key not in ("sha256", "name")}
+            facts["intact"] = card.get("sha256") == facts["sha256"]
+        except InputError as error:
+            facts["card"] = str(error)
+        found[name] = facts
+    return found
+
+
+def _lines(facts: dict[str, Any]) -> str:
+    """Show what is short; the card's long sections are for --json."""
+    short = [f"{key}: {value}" for key, value in facts.items() if not isinstance(value, (dict, list))]
+    long = [key for key, value in facts.items() if isinstance(value, (dict, list))]
+    return ("\n" + " " * 17).join([*short, *([f"{', '.join(long)}: see --json"] if long else [])])

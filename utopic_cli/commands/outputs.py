@@ -1,0 +1,214 @@
+"""The files one alignment leaves: where each goes, whether it may go there, what is in it.
+
+Everything is decided and checked before any work, made in memory, and only then written; the
+report comes last, so that a set with a report is a whole set.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from utopic_cli.errors import OutputError, UsageError
+
+if TYPE_CHECKING:
+    from utopic_cli.io.scan import Scan
+    from utopic_cli.result import RegistrationResult
+
+TRANSFORMATION_SUFFIXES = (".txt", ".npy", ".json")
+MERGED_COMMENTS = ("utopic merged scans in the target's frame: scan 0 = source, 1 = target",)
+CLOUD_KINDS = ("source_overlap", "target_overlap", "source_uncertainty", "target_uncertainty")
+
+
+@dataclass(frozen=True)
+class OutputPlan:
+    """The files asked for.
+
+    Attributes:
+        files: (kind, path) in the order of writing; a kind is ``transformation``, ``aligned``,
+            ``merged``, one of ``CLOUD_KINDS`` or ``report``, and may come twice.
+        folders: folders of whole sets, made if only they themselves are missing.
+    """
+
+    files: tuple[tuple[str, Path], ...]
+    folders: tuple[Path, ...] = ()
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The paths of all files, in the order of writing."""
+        return tuple(path for _, path in self.files)
+
+
+def plan_outputs(
+    source: Path,
+    *,
+    output: Path | None = None,
+    out_dir: Path | None = None,
+    aligned: Path | None = None,
+    merged: Path | None = None,
+    clouds: Path | None = None,
+    report: Path | None = None,
+) -> OutputPlan:
+    """Turn the output options into a list of files.
+
+    Raises:
+        UsageError: a suffix names a format that the output can't have.
+    """
+    if output is not None and output.suffix.lower() not in TRANSFORMATION_SUFFIXES:
+        known = ", ".join(TRANSFORMATION_SUFFIXES)
+        raise UsageError(f"{output}: the transformation's format is told by its suffix; use one of {known}")
+    if aligned is not None and aligned.suffix.lower() != source.suffix.lower():
+        raise UsageError(
+            f"{aligned}: --aligned keeps the source's format; let the name end in '{source.suffix}'"
+        )
+    if merged is not None and merged.suffix.lower() != ".ply":
+        raise UsageError(f"{merged}: --merged is written as PLY; let the name end in .ply")
+    files = [("transformation", output), ("aligned", aligned), ("merged", merged)]
+    if out_dir is not None:
+        files.append(("transformation", out_dir / "transformation.txt"))
+        files.append(("aligned", out_dir / f"aligned{source.suffix}"))
+    sets = [folder for folder in (clouds, out_dir) if folder is not None]
+    files += [(kind, folder / f"{kind}.ply") for folder in sets for kind in CLOUD_KINDS]
+    files += [("report", report), ("report", out_dir / "report.json" if out_dir else None)]
+    return OutputPlan(
+        files=tuple((kind, path) for kind, path in files if path is not None),
+        folders=tuple(dict.fromkeys(sets)),
+    )
+
+
+def check_outputs(plan: OutputPlan, inputs: Iterable[Path], overwrite: bool) -> None:
+    """Refuse, before any work, what could not be written afterwards or would destroy something.
+
+    Args:
+        plan: the files asked for.
+        inputs: files that are read in the same run; they are never written to, whatever is said.
+        overwrite: whether existing files may be replaced.
+
+    Raises:
+        OutputError: an output is also an input or named twice, exists and may not be replaced, or
+            its folder is missing or not writable.
+    """
+    from utopic_cli.io.output import check_writable
+
+    read = {_identity(path): path for path in inputs}
+    seen: set[Any] = set()
+    for path in plan.paths:
+        identity = _identity(path)
+        if identity in read:
+            raise OutputError(f"{path}: is an input of this run; inputs are never overwritten")
+        if identity in seen:
+            raise OutputError(f"{path}: named for two outputs; give each its own file")
+        seen.add(identity)
+    missing = [folder for folder in plan.folders if not folder.exists()]
+    for folder in missing:
+        if not folder.parent.is_dir():
+            raise OutputError(f"{folder}: the folder {folder.parent} does not exist; make it first")
+        if not os.access(folder.parent, os.W_OK | os.X_OK):
+            raise OutputError(f"{folder}: can't be made, {folder.parent} is not writable")
+    check_writable([path for path in plan.paths if path.parent not in missing], overwrite)
+
+
+def _identity(path: Path) -> Any:
+    """Tell files apart whatever they are called: links to one file are the same file."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return os.path.realpath(path)
+    return status.st_dev, status.st_ino
+
+
+def make_outputs(
+    plan: OutputPlan,
+    source: Scan,
+    target: Scan,
+    result: RegistrationResult,
+    report: bytes,
+) -> dict[Path, bytes]:
+    """Make the content of every file in the plan.
+
+    Args:
+        plan: the files asked for.
+        source: the scan that moves.
+        target: the scan that stays.
+        result: the answer.
+        report: content of the report.
+
+    Returns:
+        Content by path, in the order of writing.
+    """
+    from utopic_cli.io.ply_writer import merged_cloud_ply
+    from utopic_cli.io.transformation import format_transformation
+
+    contents: dict[Path, bytes] = {}
+    for kind, path in plan.files:
+        if kind == "transformation":
+            contents[path] = format_transformation(result.T_target_source, path.suffix.lower())
+        elif kind == "aligned":
+            contents[path] = source.moved(result.T_target_source)
+        elif kind == "merged":
+            moved = source.cloud.transformed(result.T_target_source)
+            contents[path] = merged_cloud_ply(moved.points, target.cloud.points, MERGED_COMMENTS)
+        elif kind == "report":
+            contents[path] = report
+        else:
+            contents[path] = coloured_cloud(kind, source, target, result)
+    return contents
+
+
+def coloured_cloud(kind: str, source: Scan, target: Scan, result: RegistrationResult) -> bytes:
+    """Return a scan's points with overlap and uncertainty as scalar fields, coloured by one of them.
+
+    Args:
+        kind: ``source_overlap`` and so on: which scan, and which field gives the colour.
+        source: the scan that moves; its points are written where the file has them, not moved.
+        target: the scan that stays.
+        result: the answer.
+    """
+    from utopic_cli.io.colour import colour_map
+    from utopic_cli.io.ply_writer import scalar_cloud_ply
+
+    side, shown = kind.split("_")
+    scan = source if side == "source" else target
+    fields = {name: getattr(result, f"{side}_{name}") for name in ("overlap", "uncertainty")}
+    meaning = "likely to overlap" if shown == "overlap" else "uncertain"
+    comments = (f"utopic {side} {shown}: redder = more {meaning}", "points in the scan's own frame and units")
+    return scalar_cloud_ply(scan.cloud.points, colour_map(fields[shown]), fields, comments)
+
+
+def write_outputs(plan: OutputPlan, contents: dict[Path, bytes], overwrite: bool) -> None:
+    """Write all files, the report last; if one can't be written, the new ones go again.
+
+    Raises:
+        OutputError: a folder can't be made or a file can't be written.
+    """
+    from utopic_cli.io.output import write_atomically
+
+    made: list[Path] = []
+    written: list[Path] = []
+    try:
+        for folder in plan.folders:
+            if not folder.exists():
+                _make_folder(folder)
+                made.append(folder)
+        for path, data in contents.items():
+            new = not path.exists()
+            write_atomically(path, data, overwrite=overwrite)
+            if new:
+                written.append(path)
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        for folder in reversed(made):
+            if not any(folder.iterdir()):
+                folder.rmdir()
+        raise
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: can't be made: {error.strerror}") from error

@@ -1,0 +1,289 @@
+"""The robust solve: hypotheses from the network's scores, refined, verified, the best returned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from utopic_cli.estimation.consensus import Hypothesis, consensus_hypotheses, distinct
+from utopic_cli.estimation.correspondences import (
+    candidate_correspondences,
+    linear_assignment,
+    overlap_weights,
+)
+from utopic_cli.estimation.procrustes import weighted_procrustes
+from utopic_cli.estimation.refinement import Stage, refine_coarse
+from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
+from utopic_cli.estimation.verification import verify
+from utopic_cli.geometry import rigid
+from utopic_cli.point_cloud import PointCloud
+from utopic_cli.result import Correspondences
+
+VOXELS_PER_SPACING = 2.2
+CONSENSUS_TOLERANCE = 2.5  # voxels
+MERGE_DISTANCE = 8.0  # voxels
+PROPOSED = 80
+REFINED = 20
+RIVALS = 5
+SCREENING = (Stage(5.0, 6, 250), Stage(3.0, 4, 250))
+COARSE = (Stage(3.0, 8, 1000), Stage(1.2, 8, 1000))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What the network and the preparation say about one pair.
+
+    All lengths are in one common frame unit; nodes and dense points of a scan share a frame.
+
+    Attributes:
+        source_nodes: (N, 3) float64.
+        target_nodes: (M, 3) float64.
+        matching_scores: (N, M) in [0, 1], Sinkhorn output without slack.
+        source_overlap: (N,) probability of lying in the overlap.
+        target_overlap: (M,) likewise.
+        source_certainty: (N,) in [0, 1], 1 = certain.
+        target_certainty: (M,) likewise.
+        source_dense: dense points with oriented normals, one a voxel of h / 2.2.
+        target_dense: likewise.
+        spacing: h, the spacing of the nodes.
+    """
+
+    source_nodes: np.ndarray
+    target_nodes: np.ndarray
+    matching_scores: np.ndarray
+    source_overlap: np.ndarray
+    target_overlap: np.ndarray
+    source_certainty: np.ndarray
+    target_certainty: np.ndarray
+    source_dense: PointCloud
+    target_dense: PointCloud
+    spacing: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A refined and verified transformation.
+
+    Attributes:
+        T_target_source: (4, 4) float64.
+        score: fit minus free-space violation.
+        fit: share of points with a close neighbour and agreeing normals, mean of both ways.
+        violation: share of points that stand where the other scan saw free space.
+        origin: ``consensus``, ``assignment`` or ``initial``.
+    """
+
+    T_target_source: np.ndarray
+    score: float
+    fit: float
+    violation: float
+    origin: str
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The answer of ``solve``.
+
+    Attributes:
+        T_target_source: (4, 4) float64.
+        score: fit minus free-space violation, at most 1; comparable between solvers.
+        fit: see ``Candidate``.
+        violation: see ``Candidate``.
+        rivals: distinct runners-up, best first.
+        hypotheses: how many transformations were tried.
+        correspondences: node pairs the answer rests on: those it explains within the
+            tolerance (``svd``: all of the assignment), with their weights.
+        support: share of the candidates' weight that the answer explains.
+        method: ``svd`` or ``consensus``, and for ``auto`` where the answer came from:
+            ``assignment``, ``consensus`` or ``initial``.
+    """
+
+    T_target_source: np.ndarray
+    score: float
+    fit: float
+    violation: float
+    rivals: tuple[Candidate, ...]
+    hypotheses: int
+    correspondences: Correspondences
+    support: float
+    method: str
+
+
+def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = None) -> Estimate:
+    """Find the transformation of one pair.
+
+    Args:
+        problem: what is known about the pair.
+        solver: ``svd`` is the paper's: linear assignment and overlap-weighted Procrustes,
+            nothing after it. ``consensus`` tries the transformations that many
+            correspondences agree on. ``auto`` tries both. Except for ``svd``, every
+            hypothesis is refined by coarse ICP, and verification chooses.
+        initial: (4, 4) T_target_source to try as well (with ``svd``: the better of the two).
+
+    Returns:
+        The best transformation with its rivals. The same input gives the same output.
+
+    Raises:
+        ValueError: an unknown solver, arrays that do not fit together, an initial
+            transformation that is not rigid, or scores from which no transformation follows.
+    """
+    if solver not in ("auto", "svd", "consensus"):
+        raise ValueError(f"unknown solver {solver!r}; expected auto, svd or consensus")
+    _check(problem, initial)
+    voxel = working_voxel(problem)
+    source, target = make_surface(problem.source_dense, voxel), make_surface(problem.target_dense, voxel)
+    candidates = _weighted_candidates(problem)
+    hypotheses: list[Hypothesis] = []
+    if initial is not None:
+        hypotheses.append(Hypothesis(np.asarray(initial, np.float64), np.inf, "initial"))
+    if solver != "consensus":
+        hypotheses += _assignment_hypothesis(problem)
+    if solver != "svd":
+        hypotheses += _consensus(problem, candidates, source, target, voxel)
+    if not hypotheses:
+        raise ValueError("no transformation follows from the matching scores")
+    chosen = _refine_and_verify(hypotheses, source, target, refine=solver != "svd")
+    best = chosen[0]
+    if solver == "svd" and best.origin == "assignment":
+        correspondences = _assignment(problem)
+    else:
+        correspondences = candidates
+    explained = _explained(problem, correspondences, best.T_target_source, CONSENSUS_TOLERANCE * voxel)
+    total = correspondences.weights.sum()
+    support = float(explained.weights.sum() / total) if total > 0 else 0.0
+    return Estimate(
+        T_target_source=best.T_target_source,
+        score=best.score,
+        fit=best.fit,
+        violation=best.violation,
+        rivals=tuple(chosen[1 : RIVALS + 1]),
+        hypotheses=len(hypotheses),
+        correspondences=correspondences if solver == "svd" else explained,
+        support=support,
+        method=best.origin if solver == "auto" else solver,
+    )
+
+
+def working_voxel(problem: Problem) -> float:
+    """The length v that tolerances are multiples of.
+
+    It is h / 2.2, or the dense points' own spacing where a sparse scan has fewer points than
+    that: a neighbour nearer than the spacing cannot be asked for.
+    """
+    dense = max(point_spacing(problem.source_dense.points), point_spacing(problem.target_dense.points))
+    return max(problem.spacing / VOXELS_PER_SPACING, dense)
+
+
+def _check(problem: Problem, initial: np.ndarray | None) -> None:
+    n, m = len(problem.source_nodes), len(problem.target_nodes)
+    if min(n, m) < 3:
+        raise ValueError("a transformation needs at least three nodes in each scan")
+    if problem.matching_scores.shape != (n, m):
+        raise ValueError(f"matching scores of shape {problem.matching_scores.shape}; expected {(n, m)}")
+    for name, count in (
+        ("source_overlap", n),
+        ("source_certainty", n),
+        ("target_overlap", m),
+        ("target_certainty", m),
+    ):
+        if getattr(problem, name).shape != (count,):
+            raise ValueError(f"{name} of shape {getattr(problem, name).shape}; expected {(count,)}")
+    if not problem.spacing > 0:
+        raise ValueError(f"spacing {problem.spacing} is not positive")
+    if initial is not None and not rigid.is_rigid(np.asarray(initial)):
+        raise ValueError("the initial transformation is not rigid")
+
+
+def _assignment(problem: Problem) -> Correspondences:
+    """The paper's hard correspondences with their overlap weights w_ij.
+
+    Where fewer than three points keep half their mass (an unsure network on a hard pair),
+    every row and column takes part.
+    """
+    for minimum_mass in (0.5, 0.0):
+        pairs = linear_assignment(problem.matching_scores, minimum_mass)
+        if len(pairs) >= 3:
+            break
+    return overlap_weights(pairs, problem.source_overlap, problem.target_overlap)
+
+
+def _assignment_hypothesis(problem: Problem) -> list[Hypothesis]:
+    pairs = _assignment(problem)
+    if np.count_nonzero(pairs.weights) < 3:
+        return []
+    source = problem.source_nodes[pairs.source_indices]
+    target = problem.target_nodes[pairs.target_indices]
+    return [Hypothesis(weighted_procrustes(source, target, pairs.weights), 0.0, "assignment")]
+
+
+def _weighted_candidates(problem: Problem) -> Correspondences:
+    """Candidate pairs, believed less where the network sees no overlap or is unsure.
+
+    The factors never reach zero: an overlap prediction that is wrong must not be able to
+    remove the right pairs.
+    """
+    source = (0.2 + 0.8 * problem.source_overlap) * (0.5 + 0.5 * problem.source_certainty)
+    target = (0.2 + 0.8 * problem.target_overlap) * (0.5 + 0.5 * problem.target_certainty)
+    return candidate_correspondences(problem.matching_scores * source[:, None] * target)
+
+
+def _consensus(
+    problem: Problem, candidates: Correspondences, source: Surface, target: Surface, voxel: float
+) -> list[Hypothesis]:
+    if len(candidates) < 3:
+        return []
+    source_nodes = problem.source_nodes[candidates.source_indices]
+    target_nodes = problem.target_nodes[candidates.target_indices]
+    return consensus_hypotheses(
+        source_nodes,
+        target_nodes,
+        candidates.weights,
+        CONSENSUS_TOLERANCE * voxel,
+        PROPOSED,
+        source.normals[source.tree.query(source_nodes)[1]],
+        target.normals[target.tree.query(target_nodes)[1]],
+    )
+
+
+def _refine_and_verify(
+    hypotheses: list[Hypothesis], source: Surface, target: Surface, *, refine: bool
+) -> list[Candidate]:
+    """Refine and score every hypothesis; return the distinct ones, best first."""
+    transformations = np.stack([hypothesis.T_target_source for hypothesis in hypotheses])
+    origins = np.array([hypothesis.origin for hypothesis in hypotheses])
+    centre = source.points.mean(axis=0)
+    apart = MERGE_DISTANCE * target.voxel
+    if refine:
+        transformations = refine_coarse(source, target, transformations, SCREENING)
+        quick = verify(source, target, transformations, samples=500, close=1.5, agreeing=0.7)
+        order = np.argsort(-quick.score, kind="stable")
+        order = order[distinct(transformations[order], centre, apart / 4, 2.5)][:REFINED]
+        transformations = refine_coarse(source, target, transformations[order], COARSE)
+        origins = origins[order]
+    verdict = verify(source, target, transformations)
+    order = np.argsort(-verdict.score, kind="stable")
+    order = order[distinct(transformations[order], centre, apart)]
+    return [
+        Candidate(
+            rigid.rigid(rigid.nearest_rotation(transformations[i, :3, :3]), transformations[i, :3, 3]),
+            float(verdict.score[i]),
+            float(verdict.fit[i]),
+            float(verdict.violation[i]),
+            str(origins[i]),
+        )
+        for i in order
+    ]
+
+
+def _explained(
+    problem: Problem, correspondences: Correspondences, T: np.ndarray, tolerance: float
+) -> Correspondences:
+    """The correspondences whose moved source node lies within tolerance of its partner."""
+    moved = rigid.apply(T, problem.source_nodes[correspondences.source_indices])
+    distance = np.linalg.norm(moved - problem.target_nodes[correspondences.target_indices], axis=1)
+    near = distance <= tolerance
+    return Correspondences(
+        correspondences.source_indices[near],
+        correspondences.target_indices[near],
+        correspondences.weights[near],
+    )
