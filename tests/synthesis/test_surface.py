@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.synthesis.conftest import ball, cuboid
-from utopic_cli.synthesis.surface import face_areas, normalised, sample_surface
+from utopic_cli.synthesis.surface import bounding_box, face_areas, normalised, sample_surface
 
 
 def test_points_lie_on_the_faces_with_the_windings_normals():
@@ -44,3 +44,11 @@ def test_normalised_has_radius_one_about_the_box_centre():
     vertices = normalised(cuboid((2, 1, 0.5))[0] * 40.0 + 7.0)
     assert np.linalg.norm(vertices, axis=1).max() == pytest.approx(1.0)
     np.testing.assert_allclose(vertices.max(axis=0), -vertices.min(axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 255, 256, 257, 5000])
+def test_bounding_box_is_that_of_all_points(count):
+    points = np.random.default_rng(count).standard_normal((count, 3))
+    low, high = bounding_box(points)
+    np.testing.assert_array_equal(low, points.min(axis=0))
+    np.testing.assert_array_equal(high, points.max(axis=0))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from utopic_cli.point_cloud import PointCloud
+from utopic_cli.synthesis.surface import bounding_box
 
 STEEPEST = 10.0  # tangents of the viewing angle beyond this are treated as this
 
@@ -87,8 +88,8 @@ def depth_map(points: np.ndarray, direction: np.ndarray, cell: float) -> DepthMa
     """
     frame = view_frame(direction).astype(np.float32)
     local = np.asarray(points, dtype=np.float32) @ frame.T
-    low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
-    across, up = (int(steps) + 1 for steps in (high - low) / cell)
+    low, high = bounding_box(local)
+    across, up = (int(steps) + 1 for steps in (high - low)[:2] / cell)
     inverse = np.float32(1.0 / cell)
     cells = ((local[:, 0] - low[0]) * inverse).astype(np.int32) * np.int32(up)
     cells += np.minimum(((local[:, 1] - low[1]) * inverse).astype(np.int32), np.int32(up - 1))
