@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from utopic_cli.commands.demo import demo_pair
 from utopic_cli.geometry.rigid import relative_rotation_error_deg
+from utopic_cli.synthesis.demo_object import demo_pair
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -78,7 +78,7 @@ def test_the_installed_package_is_not_the_checkout(installed, tmp_path):
 
 
 def test_align_works_from_another_folder(installed, tmp_path):
-    pair = demo_pair(0)
+    pair = demo_pair(np.random.default_rng(0))
     for name, cloud in (("a.ply", pair.source), ("b.ply", pair.target)):
         points = cloud.points[:6000]
         rows = "".join(f"{x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in points)

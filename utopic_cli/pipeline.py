@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from os import PathLike
 from typing import Any
@@ -29,8 +29,14 @@ from utopic_cli.result import Correspondences, RegistrationResult
 
 Progress = Callable[[str], None]
 
-UNIT_MISMATCH = 20.0
+UNIT_MISMATCH = 8.0
 """Extents that differ by more than this factor are named as a likely mix-up of units."""
+
+CLEAR_SCORE = 0.15
+"""An estimate that scores less may rest on normals whose sides were guessed differently."""
+
+CLEAR_OUTWARDNESS = 0.1
+"""Normals that point outwards less clearly than this (a flat sheet's) may have either side."""
 
 COUNTERPART_REACH = 3.0
 """A point has a counterpart within this many spacings of the sparser scan."""
@@ -125,6 +131,9 @@ def register(
     view = predict(model, prepared, options.seed)
     clock.start("solve")
     estimate = _solve(prepared, view, options.solver, initial)
+    if options.solver != "svd" and _sides_in_doubt(prepared, estimate):
+        clock.start("predict and solve inside out")
+        prepared, view, estimate = _better_side(model, prepared, view, estimate, options, initial)
     transformation = prepared.denormalise(estimate.T_target_source)
     if options.refine:
         clock.start("refine")
@@ -209,6 +218,33 @@ def _solve(prepared: PreparedPair, view: NetworkView, solver: str, initial: np.n
         return solve(problem, solver, None if initial is None else prepared.normalise(initial))
     except ValueError as error:
         raise InputError(f"no transformation can be found between these scans: {error}") from error
+
+
+def _sides_in_doubt(prepared: PreparedPair, estimate: Estimate) -> bool:
+    """Tell whether the two scans may have been given normals on opposite sides."""
+    sheet = min(prepared.source.outwardness, prepared.target.outwardness) < CLEAR_OUTWARDNESS
+    return sheet or estimate.score < CLEAR_SCORE
+
+
+def _better_side(
+    model: Utopic,
+    prepared: PreparedPair,
+    view: NetworkView,
+    estimate: Estimate,
+    options: AlignOptions,
+    initial: np.ndarray | None,
+) -> tuple[PreparedPair, NetworkView, Estimate]:
+    """Try the source with its normals reversed, and return what verification likes better.
+
+    Nothing in a point cloud says which side of a surface is the outside. The rule that
+    decides gives both scans the same side nearly always; where it may not have, both are tried.
+    """
+    reversed_pair = replace(prepared, source=prepared.source.turned_inside_out())
+    reversed_view = predict(model, reversed_pair, options.seed)
+    other = _solve(reversed_pair, reversed_view, options.solver, initial)
+    if other.score > estimate.score:
+        return reversed_pair, reversed_view, other
+    return prepared, view, estimate
 
 
 def _as_cloud(scan: str | PathLike[str] | np.ndarray, name: str) -> PointCloud:

@@ -8,11 +8,12 @@ share this file, so what the network is shown never differs between them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from utopic_cli.errors import InputError
 from utopic_cli.geometry.normals import estimate_normals, orient_normals, orient_towards
 from utopic_cli.geometry.voxel import cell_means, voxel_downsample, voxel_index
 from utopic_cli.point_cloud import PointCloud
@@ -25,6 +26,9 @@ PATCHES = ((1.8, 32), (3.6, 24), (7.2, 24))
 
 DENSE_RATIO = 2.2
 """Node spacing over the voxel size of the dense cloud."""
+
+FEWEST_DENSE_POINTS = 30
+"""A scan that shrinks to fewer points than this at the pair's common spacing can't be aligned."""
 
 MOST_POINTS = 400_000
 """A larger cloud is thinned evenly to about this many points before anything else."""
@@ -51,6 +55,19 @@ class SampledCloud:
     patch_masks: tuple[np.ndarray, ...]
     dense: PointCloud
     node_index: np.ndarray
+
+    def turned_inside_out(self) -> SampledCloud:
+        """Return the cloud with every normal reversed."""
+        patches = tuple(np.concatenate([patch[..., :3], -patch[..., 3:]], axis=2) for patch in self.patches)
+        dense = PointCloud(self.dense.points, -_normals_of(self.dense))
+        return replace(self, normals=-self.normals, patches=patches, dense=dense)
+
+    @property
+    def outwardness(self) -> float:
+        """How clearly the normals point away from the centroid, in [-1, 1]; near 0 for a flat sheet."""
+        offset = self.dense.points - self.dense.points.mean(axis=0)
+        height = np.einsum("nd,nd->n", _normals_of(self.dense), offset)
+        return float(height.sum() / max(np.linalg.norm(offset, axis=1).sum(), 1e-12))
 
 
 @dataclass(frozen=True)
@@ -109,6 +126,10 @@ def prepare(
         source_viewpoint: (3,) where the scanner stood, in the source's own frame, if known:
             normals then face it, which is faster than propagating signs.
         target_viewpoint: likewise for the target.
+
+    Raises:
+        InputError: one scan is so much smaller than the other that nothing of it is left at a
+            spacing that suits both.
     """
     centres = [cloud.points.mean(axis=0) for cloud in (source, target)]
     centred = [cloud.points - centre for cloud, centre in zip((source, target), centres, strict=True)]
@@ -119,6 +140,7 @@ def prepare(
         None if view is None else (view - centre) / scale
         for view, centre in zip((source_viewpoint, target_viewpoint), centres, strict=True)
     ]
+    _check_sizes(thinned, spacing)
     sampled = [
         sample(part, spacing, points, viewpoint=view) for part, view in zip(thinned, viewpoints, strict=True)
     ]
@@ -216,6 +238,18 @@ def _common_spacing(clouds: list[np.ndarray], most: int) -> float:
     )
 
 
+def _check_sizes(clouds: list[np.ndarray], spacing: float) -> None:
+    """Refuse a pair whose smaller scan is but a dot beside the larger one."""
+    if min(voxel_index(points, spacing / DENSE_RATIO)[1] for points in clouds) >= FEWEST_DENSE_POINTS:
+        return
+    extents = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in clouds]
+    ratio = max(extents) / max(min(extents), 1e-300)
+    raise InputError(
+        f"the scans' sizes differ by a factor of about {ratio:.3g}: bring both to the same unit "
+        "(millimetres against metres?)"
+    )
+
+
 def _voxel_size_for(points: np.ndarray, most: int) -> float:
     """Return the voxel size that leaves at most, and nearly, ``most`` cells."""
     low, high = 1e-4, 2.0
@@ -262,15 +296,11 @@ def _patch(
     return patch.astype(np.float32), mask
 
 
+def _normals_of(cloud: PointCloud) -> np.ndarray:
+    assert cloud.normals is not None  # every dense cloud is made with them
+    return cloud.normals
+
+
 def _with_node_index(cloud: SampledCloud, points: np.ndarray) -> SampledCloud:
     """Fill in which original point is nearest to each node."""
-    index = cKDTree(points).query(cloud.points)[1]
-    return SampledCloud(
-        cloud.points,
-        cloud.normals,
-        cloud.neighbours,
-        cloud.patches,
-        cloud.patch_masks,
-        cloud.dense,
-        index,
-    )
+    return replace(cloud, node_index=cKDTree(points).query(cloud.points)[1])

@@ -5,25 +5,27 @@ import json
 import numpy as np
 import pytest
 
-from utopic_cli.commands.demo import demo_pair
 from utopic_cli.io.scan import read_scan
+from utopic_cli.synthesis.demo_object import demo_pair
 
 
 @pytest.fixture(scope="module")
 def pair():
-    return demo_pair(0)
+    return demo_pair(np.random.default_rng(0))
 
 
 def test_the_scans_are_two_views_of_one_object_with_overlap_and_a_large_motion(pair):
     assert 0.4 < pair.smaller_overlap < 0.9
-    assert all(5000 < len(cloud) <= 15000 for cloud in (pair.source, pair.target))
+    assert all(5000 < len(cloud) <= 20_000 for cloud in (pair.source, pair.target))
     angle = np.degrees(np.arccos((np.trace(pair.gt_T_target_source[:3, :3]) - 1) / 2))
     assert angle > 30
 
 
 def test_the_same_seed_gives_the_same_scans_and_another_seed_others(pair):
-    np.testing.assert_array_equal(demo_pair(0).source.points, pair.source.points)
-    assert not np.array_equal(demo_pair(1).source.points[:100], pair.source.points[:100])
+    np.testing.assert_array_equal(demo_pair(np.random.default_rng(0)).source.points, pair.source.points)
+    assert not np.array_equal(
+        demo_pair(np.random.default_rng(1)).source.points[:100], pair.source.points[:100]
+    )
 
 
 def test_demo_writes_the_whole_set_and_says_how_far_off_it_is(cli, fake, tmp_path, pair):

@@ -9,6 +9,8 @@ from utopic_cli.estimation.surface import make_surface
 from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud
 
+Scans = tuple[PointCloud, PointCloud]
+
 
 def perturbed(gt: np.ndarray, degrees: float, shift: float, centre: np.ndarray) -> np.ndarray:
     """Turn a transformation about the moved centre and shift it."""
@@ -18,9 +20,7 @@ def perturbed(gt: np.ndarray, degrees: float, shift: float, centre: np.ndarray) 
     return rigid.rigid(turn, moved - turn @ moved + np.array([0.0, shift, 0.0])) @ gt
 
 
-def test_coarse_refinement_pulls_many_hypotheses_in(
-    scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray
-) -> None:
+def test_coarse_refinement_pulls_many_hypotheses_in(scans: Scans, gt_transformation: np.ndarray) -> None:
     source, target = (make_surface(scan, VOXEL) for scan in scans)
     centre = scans[0].points.mean(axis=0)
     starts = np.stack(
@@ -34,7 +34,7 @@ def test_coarse_refinement_pulls_many_hypotheses_in(
 
 
 def test_coarse_refinement_leaves_hypotheses_without_partners_alone(
-    scans: tuple[PointCloud, PointCloud],
+    scans: Scans,
 ) -> None:
     source, target = (make_surface(scan, VOXEL) for scan in scans)
     far = rigid.rigid(np.eye(3), np.array([100.0, 0.0, 0.0]))
@@ -43,7 +43,7 @@ def test_coarse_refinement_leaves_hypotheses_without_partners_alone(
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_refine_improves_a_perturbed_transformation(
-    scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray, scale: float
+    scans: Scans, gt_transformation: np.ndarray, scale: float
 ) -> None:
     source, target = (PointCloud(scan.points * scale) for scan in scans)
     gt = rigid.rigid(gt_transformation[:3, :3], gt_transformation[:3, 3] * scale)
@@ -56,7 +56,7 @@ def test_refine_improves_a_perturbed_transformation(
     assert rigid.is_rigid(result.T_target_source, 1e-12)
 
 
-def test_refine_keeps_the_transformation_where_nothing_meets(scans: tuple[PointCloud, PointCloud]) -> None:
+def test_refine_keeps_the_transformation_where_nothing_meets(scans: Scans) -> None:
     source, target = scans
     far = rigid.rigid(np.eye(3), np.array([50.0, 0.0, 0.0]))
     result = refine(source, target, far)
@@ -65,9 +65,7 @@ def test_refine_keeps_the_transformation_where_nothing_meets(scans: tuple[PointC
     assert result.residual == result.initial_residual == pytest.approx(result.threshold)
 
 
-def test_refine_keeps_a_perfect_transformation(
-    gt_transformation: np.ndarray, scans: tuple[PointCloud, PointCloud]
-) -> None:
+def test_refine_keeps_a_perfect_transformation(gt_transformation: np.ndarray, scans: Scans) -> None:
     source, _ = scans
     result = refine(source, source.transformed(gt_transformation), gt_transformation)
     assert np.abs(result.T_target_source - gt_transformation).max() < 1e-9
@@ -82,9 +80,7 @@ def test_refine_never_raises_the_residual_on_noise() -> None:
         assert rigid.is_rigid(result.T_target_source)
 
 
-def test_refine_thins_large_scans(
-    scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray
-) -> None:
+def test_refine_thins_large_scans(scans: Scans, gt_transformation: np.ndarray) -> None:
     source, target = scans
     centre = source.points.mean(axis=0)
     start = perturbed(gt_transformation, 1.5, 0.01, centre)
@@ -92,7 +88,7 @@ def test_refine_thins_large_scans(
     assert rigid.relative_rotation_error_deg(result.T_target_source, gt_transformation) < 0.5
 
 
-def test_refine_refuses_degenerate_input(scans: tuple[PointCloud, PointCloud]) -> None:
+def test_refine_refuses_degenerate_input(scans: Scans) -> None:
     source, _ = scans
     with pytest.raises(ValueError, match="six points"):
         refine(source, PointCloud(np.eye(3)), np.eye(4))

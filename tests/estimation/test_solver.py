@@ -10,9 +10,11 @@ from utopic_cli.estimation.solver import Estimate, Problem, solve
 from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud
 
+Scans = tuple[PointCloud, PointCloud]
+
 
 @pytest.fixture(scope="module")
-def hard_problem(scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray) -> Problem:
+def hard_problem(scans: Scans, gt_transformation: np.ndarray) -> Problem:
     return make_problem(*scans, gt_transformation, wrong=0.85)
 
 
@@ -42,9 +44,7 @@ def test_solves_a_pair_with_mostly_wrong_scores(
     assert len(pairs) > 3 and apart.max() <= 2.6 * VOXEL
 
 
-def test_svd_is_the_papers_solver_and_nothing_more(
-    scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray
-) -> None:
+def test_svd_is_the_papers_solver_and_nothing_more(scans: Scans, gt_transformation: np.ndarray) -> None:
     easy = make_problem(*scans, gt_transformation, wrong=0.0)
     estimate = solve(easy, "svd")
     assert estimate.method == "svd" and estimate.hypotheses == 1 and not estimate.rivals

@@ -9,6 +9,8 @@ from utopic_cli.estimation.verification import measure_fit, verify
 from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud
 
+Scans = tuple[PointCloud, PointCloud]
+
 
 def sheet(z: float, across: float = 1.0, step: float = 0.02) -> PointCloud:
     """A level square seen from above (+z)."""
@@ -59,9 +61,7 @@ def test_opposite_normals_do_not_fit() -> None:
     assert verify(surface, surface, flipped[None]).fit[0] == 0.0
 
 
-def test_the_true_transformation_scores_best(
-    scans: tuple[PointCloud, PointCloud], gt_transformation: np.ndarray
-) -> None:
+def test_the_true_transformation_scores_best(scans: Scans, gt_transformation: np.ndarray) -> None:
     source, target = (make_surface(scan, VOXEL) for scan in scans)
     rng = np.random.default_rng(0)
     others = [rigid.rigid(rigid.random_rotation(rng), gt_transformation[:3, 3]) for _ in range(20)]
@@ -83,7 +83,13 @@ def test_thinning_keeps_no_step_with_the_rows_of_a_range_image() -> None:
     kept = thinned(np.column_stack([columns, columns, columns]).astype(float), 1000)[:, 0]
     assert len(kept) == 1000
     assert np.bincount(kept.astype(int), minlength=100).min() >= 1
-    assert point_spacing(sheet(0.0).points) == pytest.approx(0.02)
+
+
+def test_point_spacing_is_that_of_the_places() -> None:
+    points = sheet(0.0).points
+    assert point_spacing(points) == pytest.approx(0.02)
+    assert point_spacing(np.concatenate([points, points, points])) == pytest.approx(0.02)
+    assert point_spacing(np.ones((5, 3))) == 0.0
 
 
 def test_measure_fit_counts_both_ways_in_the_points_own_units() -> None:

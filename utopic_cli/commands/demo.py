@@ -28,12 +28,6 @@ if TYPE_CHECKING:
     from utopic_cli.synthesis.scan_pair import ScanPair
 
 _DEFAULTS = AlignOptions()
-OBJECT = 1  # which of the procedural shapes: all sides differ
-SURFACE_SAMPLES = 200_000
-SCAN_POINTS = 15_000
-VIEW_ANGLE_DEG = 60.0
-NOISE = 0.001  # standard deviation along the ray, in extents of the object
-CELL = 1 / 200  # resolution of the simulated scanner, in extents
 
 
 def demo(
@@ -62,7 +56,11 @@ def demo(
     check_outputs(everything, (), overwrite)
     with console.progress() as progress:
         progress("simulating two range scans")
-        pair = demo_pair(seed)
+        import numpy as np
+
+        from utopic_cli.synthesis.demo_object import demo_pair
+
+        pair = demo_pair(np.random.default_rng(seed))
         contents = {
             source: _scan_file(pair.source.points, "source"),
             target: _scan_file(pair.target.points, "target"),
@@ -81,39 +79,6 @@ def demo(
     console.line(
         "*_overlap.ply and *_uncertainty.ply are redder where there is more; report.json has the numbers"
     )
-
-
-def demo_pair(seed: int) -> ScanPair:
-    """Simulate two range scans of the demo's object, each moved into a frame of its own.
-
-    Args:
-        seed: seed of the sampling, the noise and the two motions; the object is always the same.
-    """
-    import numpy as np
-
-    from utopic_cli.synthesis.procedural import procedural_mesh
-    from utopic_cli.synthesis.scan_pair import posed_pair
-    from utopic_cli.synthesis.scanner import range_scan
-    from utopic_cli.synthesis.surface import sample_surface
-
-    rng = np.random.default_rng(seed)
-    vertices, faces = procedural_mesh(np.random.default_rng(OBJECT), resolution=96)
-    points, normals = sample_surface(vertices, faces, SURFACE_SAMPLES, rng)
-    extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
-    half = np.radians(VIEW_ANGLE_DEG / 2)
-    clouds = [
-        range_scan(
-            points,
-            normals,
-            np.array([np.cos(angle), np.sin(angle), 0.35]),
-            rng,
-            cell=CELL * extent,
-            count=SCAN_POINTS,
-            noise=NOISE * extent,
-        ).points
-        for angle in (-half, half)
-    ]
-    return posed_pair(clouds[0], clouds[1], "range_scan", extent, rng, translation=1.0)
 
 
 def _scan_file(points: np.ndarray, name: str) -> bytes:

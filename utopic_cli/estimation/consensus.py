@@ -10,7 +10,7 @@ from utopic_cli.estimation.procrustes import procrustes_batch
 
 MERGE_ANGLE_DEG = 10.0
 NORMAL_TOLERANCE = 0.4
-SEEDS = 400
+SEEDS = 1000
 NEIGHBOURS = 20
 
 

@@ -23,8 +23,10 @@ from utopic_cli.result import Correspondences
 VOXELS_PER_SPACING = 2.2
 CONSENSUS_TOLERANCE = 2.5  # voxels
 MERGE_DISTANCE = 8.0  # voxels
-PROPOSED = 80
-REFINED = 20
+PROPOSED = 200
+FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
+BEYOND_DOUBT = 0.5  # score
+REFINED = 30
 RIVALS = 5
 SCREENING = (Stage(5.0, 6, 250), Stage(3.0, 4, 250))
 COARSE = (Stage(3.0, 8, 1000), Stage(1.2, 8, 1000))
@@ -142,7 +144,11 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
         hypotheses += _consensus(problem, candidates, source, target, voxel)
     if not hypotheses:
         raise ValueError("no transformation follows from the matching scores")
-    chosen = _refine_and_verify(hypotheses, source, target, refine=solver != "svd")
+    tried = hypotheses[:FIRST]
+    chosen = _refine_and_verify(tried, source, target, refine=solver != "svd")
+    if chosen[0].score < BEYOND_DOUBT and len(hypotheses) > FIRST:
+        tried = hypotheses
+        chosen = _refine_and_verify(tried, source, target, refine=True)
     best = chosen[0]
     if solver == "svd" and best.origin == "assignment":
         correspondences = _assignment(problem)
@@ -157,7 +163,7 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
         fit=best.fit,
         violation=best.violation,
         rivals=tuple(chosen[1 : RIVALS + 1]),
-        hypotheses=len(hypotheses),
+        hypotheses=len(tried),
         correspondences=correspondences if solver == "svd" else explained,
         support=support,
         method=best.origin if solver == "auto" else solver,

@@ -62,15 +62,23 @@ def thinned(points: np.ndarray, limit: int) -> np.ndarray:
 
 
 def point_spacing(points: np.ndarray, tree: cKDTree | None = None) -> float:
-    """Median distance of a point to its nearest neighbour, in the points' units.
+    """Median distance of a point to its nearest neighbour elsewhere, in the points' units.
 
     Args:
         points: (N, 3), at least two.
         tree: index of the points, if there is one already.
+
+    Returns:
+        The spacing; 0 only if all points coincide.
     """
     some = thinned(points, 5_000)
     distance, _ = (tree if tree is not None else cKDTree(points)).query(some, k=2)
-    return float(np.median(distance[:, 1]))
+    spacing = float(np.median(distance[:, 1]))
+    if spacing == 0.0:  # most points are there twice, as in merged files: the places count
+        places = np.unique(points, axis=0)
+        if 1 < len(places) < len(points):
+            return point_spacing(places)
+    return spacing
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from utopic_cli.synthesis.implicit import ball, blend, box, carve, grid_points, limb, ring, surface_net
@@ -12,7 +14,8 @@ from utopic_cli.synthesis.surface import bounding_diagonal, normalised, sample_s
 SAMPLES = 300_000
 
 
-def demo_mesh(resolution: int = 112) -> tuple[np.ndarray, np.ndarray]:
+@lru_cache(maxsize=1)
+def demo_mesh(resolution: int = 96) -> tuple[np.ndarray, np.ndarray]:
     """Model a sitting dragon with wings, a coiled tail, a collar and a scaly back.
 
     No two sides of it are alike, so its pose is never ambiguous.

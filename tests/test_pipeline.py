@@ -1,0 +1,181 @@
+"""The whole path with the bundled weights, on simulated scans with a known answer."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from utopic_cli import align
+from utopic_cli.config import AlignOptions
+from utopic_cli.errors import InputError, UsageError
+from utopic_cli.geometry import rigid
+from utopic_cli.io.ply_writer import scalar_cloud_ply
+from utopic_cli.pipeline import register
+from utopic_cli.point_cloud import PointCloud
+from utopic_cli.synthesis.demo_object import demo_pair
+
+OPTIONS = AlignOptions(points=600)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return demo_pair(np.random.default_rng(0), points=6000)
+
+
+@pytest.fixture(scope="module")
+def result(pair):
+    return register(pair.source, pair.target, OPTIONS)
+
+
+def rotation_error(found, gt):
+    return rigid.relative_rotation_error_deg(found, gt)
+
+
+def place_error(found, gt, cloud):
+    return rigid.relative_translation_error(found, gt, cloud.points.mean(axis=0))
+
+
+def test_the_known_answer_is_found(pair, result):
+    assert rotation_error(result.T_target_source, pair.gt_T_target_source) < 0.5
+    assert place_error(result.T_target_source, pair.gt_T_target_source, pair.source) < 0.005 * pair.extent
+    assert rigid.is_rigid(result.T_target_source, 1e-9)
+
+
+def test_every_original_point_gets_an_overlap_and_an_uncertainty(pair, result):
+    for values, cloud in (
+        (result.source_overlap, pair.source),
+        (result.source_uncertainty, pair.source),
+        (result.target_overlap, pair.target),
+        (result.target_uncertainty, pair.target),
+    ):
+        assert values.shape == (len(cloud),) and values.dtype == np.float32
+        assert values.min() >= 0 and values.max() <= 1 and np.ptp(values) > 0.1
+
+
+def test_overlap_is_told_better_than_by_chance(pair, result):
+    moved = rigid.apply(pair.gt_T_target_source, pair.source.points)
+    from scipy.spatial import cKDTree
+
+    known = cKDTree(pair.target.points).query(moved)[0] < 0.02 * pair.extent
+    inside, outside = result.source_overlap[known], result.source_overlap[~known]
+    ranks = (inside[:, None] > outside[None, ::7]).mean()  # area under the ROC curve
+    assert ranks > 0.75
+
+
+def test_correspondences_are_pairs_of_original_points_that_the_answer_explains(pair, result):
+    pairs = result.correspondences
+    assert len(pairs) >= 3 and (pairs.weights >= 0).all()
+    moved = rigid.apply(result.T_target_source, pair.source.points[pairs.source_indices])
+    distance = np.linalg.norm(moved - pair.target.points[pairs.target_indices], axis=1)
+    assert np.median(distance) < 0.05 * pair.extent
+
+
+def test_the_same_seed_gives_the_same_bits(pair, result):
+    again = register(pair.source, pair.target, OPTIONS)
+    assert np.array_equal(again.T_target_source, result.T_target_source)
+    for name in ("source_overlap", "target_overlap", "source_uncertainty", "target_uncertainty"):
+        assert np.array_equal(getattr(again, name), getattr(result, name)), name
+    other = register(pair.source, pair.target, dataclasses.replace(OPTIONS, seed=1))
+    assert not np.array_equal(other.source_uncertainty, result.source_uncertainty)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_another_unit_scales_the_translation_alone(pair, result, scale):
+    found = register(
+        PointCloud(pair.source.points * scale), PointCloud(pair.target.points * scale), OPTIONS
+    ).T_target_source
+    np.testing.assert_allclose(found[:3, :3], result.T_target_source[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(found[:3, 3], scale * result.T_target_source[:3, 3], rtol=1e-5)
+
+
+def test_coordinates_the_size_of_a_country_lose_nothing(pair, result):
+    shift = np.array([4e5, 5e6, 300.0])
+    moved = PointCloud(pair.source.points + shift), PointCloud(pair.target.points + shift)
+    found = register(*moved, OPTIONS).T_target_source
+    # Found on shifted scans, T maps p + s to T0 p + s.
+    expected = result.T_target_source.copy()
+    expected[:3, 3] += shift - expected[:3, :3] @ shift
+    assert rotation_error(found, expected) < 1e-4
+    assert place_error(found, expected, moved[0]) < 1e-6 * pair.extent
+
+
+def test_a_moved_input_composes(pair, result):
+    rng = np.random.default_rng(3)
+    motion = rigid.rigid(rigid.random_rotation(rng), rng.standard_normal(3))
+    found = register(pair.source.transformed(motion), pair.target, OPTIONS).T_target_source
+    expected = result.T_target_source @ rigid.invert(motion)
+    assert rotation_error(found, expected) < 0.3
+    assert place_error(found @ motion, result.T_target_source, pair.source) < 0.003 * pair.extent
+
+
+def test_swapping_the_scans_inverts_the_transformation(pair, result):
+    found = register(pair.target, pair.source, OPTIONS).T_target_source
+    expected = rigid.invert(result.T_target_source)
+    assert rotation_error(found, expected) < 0.3
+    assert place_error(found, expected, pair.target) < 0.003 * pair.extent
+
+
+def test_the_order_of_points_and_repeated_points_hardly_matter(pair, result):
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(pair.source))
+    shuffled = np.concatenate([pair.source.points[order], pair.source.points[:100]])
+    found = register(PointCloud(shuffled), pair.target, OPTIONS)
+    assert rotation_error(found.T_target_source, result.T_target_source) < 0.2
+    overlap = found.source_overlap[: len(order)]
+    assert np.abs(overlap - result.source_overlap[order]).mean() < 0.05
+
+
+def test_a_right_initial_transformation_is_used(pair):
+    sparse = PointCloud(pair.source.points[::12]), PointCloud(pair.target.points[::12])
+    found = register(*sparse, OPTIONS, initial=pair.gt_T_target_source)
+    assert rotation_error(found.T_target_source, pair.gt_T_target_source) < 5
+
+
+def test_the_papers_solver_returns_a_rigid_motion(pair):
+    found = register(pair.source, pair.target, dataclasses.replace(OPTIONS, solver="svd", refine=False))
+    assert rigid.is_rigid(found.T_target_source, 1e-9)
+    assert found.options["solver"] == "svd"
+
+
+def test_arrays_and_files_give_the_same_answer(pair, tmp_path):
+    paths = []
+    for name, cloud in (("a", pair.source), ("b", pair.target)):
+        grey = np.zeros((len(cloud), 3), np.uint8)
+        paths.append(tmp_path / f"{name}.ply")
+        paths[-1].write_bytes(scalar_cloud_ply(cloud.points, grey, {}, ()))
+    from_files = align(*paths, points=300)
+    from_arrays = align(pair.source.points, pair.target.points, points=300)
+    assert np.array_equal(from_files.T_target_source, from_arrays.T_target_source)
+
+
+def test_scans_of_very_different_size_are_named(pair):
+    found = register(PointCloud(pair.source.points * 9), pair.target, OPTIONS)
+    assert any("factor of about" in warning and "same unit" in warning for warning in found.warnings)
+    with pytest.raises(InputError, match="sizes differ by a factor of about 1.*same unit"):
+        register(PointCloud(pair.source.points * 1000), pair.target, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((100, 2)), r"source: an array of shape \(100, 2\); expected \(N, 3\)"),
+        (np.zeros((100, 3)), "source: 1 distinct finite points; at least 50"),
+        (np.full((100, 3), np.nan), "source: 0 distinct finite points"),
+        (np.outer(np.arange(100.0), [1, 2, 3]), "source: all points lie on one line"),
+    ],
+    ids=["two columns", "all equal", "all NaN", "a line"],
+)
+def test_arrays_that_cannot_be_used_are_explained(pair, points, message):
+    with pytest.raises(InputError, match=message):
+        align(points, pair.target.points)
+
+
+def test_unknown_options_are_explained(pair):
+    with pytest.raises(UsageError, match="known options: weights, points"):
+        align(pair.source.points, pair.target.points, voxel=3)
+    with pytest.raises(UsageError, match="no such solver; choose auto"):
+        align(pair.source.points, pair.target.points, solver="magic")
+    with pytest.raises(InputError, match="no bundled weights of that name"):
+        align(pair.source.points, pair.target.points, weights="absent")
