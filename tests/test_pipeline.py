@@ -153,7 +153,7 @@ def test_arrays_and_files_give_the_same_answer(pair, tmp_path):
 def test_scans_of_very_different_size_are_named(pair):
     found = register(PointCloud(pair.source.points * 9), pair.target, OPTIONS)
     assert any("factor of about" in warning and "same unit" in warning for warning in found.warnings)
-    with pytest.raises(InputError, match="sizes differ by a factor of about 1.*same unit"):
+    with pytest.raises(InputError, match=r"sizes differ by a factor of about 1.*same unit"):
         register(PointCloud(pair.source.points * 1000), pair.target, OPTIONS)
 
 
