@@ -24,7 +24,7 @@ class ModelConfig:
     The paper's own setting is ``input_features="coordinates"``, ``layers=3``, ``heads=4``,
     ``transformer_width=256``, ``feature_width=512``, ``channels=(64, 64, 128, 256)``,
     ``adaptive_hidden=64``, ``kernel_rank=0``, ``neighbours=20``, ``normalisation="batch"``,
-    ``sinkhorn_iterations=20``, ``descriptor_skip=False``.
+    ``sinkhorn_iterations=20``, ``descriptor_skip=False``, ``hypothesis=False``.
 
     Attributes:
         input_features: ``invariant`` (local geometry of the dense scan, the same in any
@@ -45,6 +45,7 @@ class ModelConfig:
         uncertainty_samples: K of the overlap distribution.
         sinkhorn_iterations: rounds of row and column normalisation.
         descriptor_skip: add the extractor's similarity to both affinities.
+        hypothesis: accept a transformation under test as further evidence (not in the paper).
         normalisation: ``layer`` (independent of batch mates) or ``batch`` (the paper's).
     """
 
@@ -65,6 +66,7 @@ class ModelConfig:
     uncertainty_samples: int = 50
     sinkhorn_iterations: int = 5
     descriptor_skip: bool = True
+    hypothesis: bool = True
     normalisation: str = "layer"
 
 

@@ -138,6 +138,9 @@ def register(
     if options.refine:
         clock.start("refine")
         transformation = refine(source, target, transformation).T_target_source
+    if model.config.hypothesis and options.solver != "svd":
+        clock.start("look again")
+        view = predict(model, prepared, options.seed, prepared.normalise(transformation))
     clock.start("measure")
     correspondences = _in_original_points(estimate.correspondences, prepared)
     threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
@@ -174,8 +177,17 @@ def register(
     )
 
 
-def predict(model: Utopic, prepared: PreparedPair, seed: int) -> NetworkView:
-    """Run the network on a prepared pair, on the device its weights are on."""
+def predict(
+    model: Utopic, prepared: PreparedPair, seed: int, hypothesis: np.ndarray | None = None
+) -> NetworkView:
+    """Run the network on a prepared pair, on the device its weights are on.
+
+    Args:
+        model: the network.
+        prepared: the pair.
+        seed: seed of the overlap samples.
+        hypothesis: (4, 4) transformation between the normalised clouds to judge the points by.
+    """
     device = next(model.parameters()).device
     k = model.config.neighbours
     with torch.inference_mode():
@@ -183,11 +195,17 @@ def predict(model: Utopic, prepared: PreparedPair, seed: int) -> NetworkView:
             to_cloud_input(prepared.source, prepared.spacing, k).to(device),
             to_cloud_input(prepared.target, prepared.spacing, k).to(device),
             generator=torch.Generator().manual_seed(seed),
+            hypothesis=None
+            if hypothesis is None
+            else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
         )
+    source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
+    if not model.config.overlap:  # the variant without O weighs all correspondences alike
+        source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
     return NetworkView(
         _array(prediction.matching_scores[:, :-1, :-1]),
-        _array(prediction.source_overlap),
-        _array(prediction.target_overlap),
+        _array(source_overlap),
+        _array(target_overlap),
         _array(prediction.source_uncertainty),
         _array(prediction.target_uncertainty),
         _array(prediction.source_distribution.raw_uncertainty),

@@ -77,9 +77,8 @@ def test_the_export_is_the_average_of_the_weights(shapes, tmp_path):
 def test_one_pair_can_be_learnt_by_heart(shapes):
     torch.manual_seed(0)
     config = dataclasses.replace(CONFIG.model, descriptor_width=16, feature_width=32)
-    pair = to_training_pair(
-        *sample_pair(random_pair(shapes, np.random.default_rng(3), PairSettings()), 80), config.neighbours
-    )
+    rng = np.random.default_rng(3)
+    pair = to_training_pair(sample_pair(random_pair(shapes, rng, PairSettings()), 80, rng), config.neighbours)
     network = TrainingNetwork(config)
     optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3)
     weights = CONFIG.loss.weights()

@@ -36,6 +36,16 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
     )
 
 
+def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
+    """Return the (3, 3) rotation about a (3,) vector by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+
+
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm."""
     u, _, vt = np.linalg.svd(matrix)

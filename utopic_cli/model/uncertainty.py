@@ -38,7 +38,9 @@ class UncertaintyQuantification(nn.Module):
         """Quantify features (B, N, V); ``generator`` draws the K samples on the CPU."""
         mean = self.mean(features).squeeze(-1).float()
         log_variance = self.log_variance(features).squeeze(-1).float().clamp(-8.0, 4.0)
-        shape = (mean.shape[0], self.samples, mean.shape[1])
+        # Points share their draws at inference: each point's samples have the same distribution,
+        # but K draws of its own would speckle the variance by a fifth.
+        shape = (mean.shape[0], self.samples, mean.shape[1] if self.training else 1)
         noise = torch.randn(shape, generator=generator).to(mean.device)
         deviation = (0.5 * log_variance).exp()
         samples = torch.sigmoid(mean[:, None] + noise * deviation[:, None])

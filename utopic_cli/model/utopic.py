@@ -12,6 +12,7 @@ from utopic_cli.model.attention import GeometryTransformer
 from utopic_cli.model.cloud_input import CloudInput
 from utopic_cli.model.feature_extractor import FeatureExtractor
 from utopic_cli.model.geometric_embedding import geometric_embedding
+from utopic_cli.model.hypothesis import HYPOTHESIS_FEATURES, hypothesis_features, inverse
 from utopic_cli.model.matching import AffinityMatching
 from utopic_cli.model.overlap_head import OverlapHead
 from utopic_cli.model.uncertainty import (
@@ -80,6 +81,9 @@ class Utopic(nn.Module):
         self.second_transformer = GeometryTransformer(config)
         self.second_matching = AffinityMatching(width, config.sinkhorn_iterations, config.descriptor_skip)
         self.overlap_head = OverlapHead(width)
+        if config.hypothesis:
+            self.hypothesis = nn.Linear(HYPOTHESIS_FEATURES, width, bias=False)
+            nn.init.zeros_(self.hypothesis.weight)
 
     def forward(
         self,
@@ -88,6 +92,8 @@ class Utopic(nn.Module):
         *,
         generator: torch.Generator,
         masking: bool = False,
+        hypothesis: Tensor | None = None,
+        hypothesis_present: Tensor | None = None,
     ) -> Prediction:
         """Predict correspondences, overlap and uncertainty.
 
@@ -96,6 +102,8 @@ class Utopic(nn.Module):
             target: clouds of M points; N and M may differ.
             generator: CPU generator of the overlap samples and of random masking.
             masking: drop features at random in proportion to uncertainty (training only).
+            hypothesis: (B, 4, 4) T_target_source under test, in normalised units, or None.
+            hypothesis_present: (B,) 1 or 0 for each pair; all 1 if None.
         """
         source_features, source_descriptors = self.extractor(source)
         target_features, target_descriptors = self.extractor(target)
@@ -107,7 +115,17 @@ class Utopic(nn.Module):
             target_embedding = geometric_embedding(target.points, target.neighbours)
         where = (source.points, target.points, source_embedding, target_embedding)
 
-        source_hybrid, target_hybrid = self.first_transformer(source_features, target_features, *where)
+        source_known, target_known = source_features, target_features
+        if hypothesis is not None and self.config.hypothesis:
+            if hypothesis_present is None:
+                hypothesis_present = torch.ones(len(hypothesis), device=hypothesis.device)
+            source_known = source_features + self.hypothesis(
+                hypothesis_features(source, target, hypothesis, hypothesis_present)
+            )
+            target_known = target_features + self.hypothesis(
+                hypothesis_features(target, source, inverse(hypothesis), hypothesis_present)
+            )
+        source_hybrid, target_hybrid = self.first_transformer(source_known, target_known, *where)
         coarse = self.first_matching(source_hybrid, target_hybrid, similarity)
         source_distribution = self.quantification(source_hybrid, generator)
         target_distribution = self.quantification(target_hybrid, generator)
@@ -144,8 +162,12 @@ class Utopic(nn.Module):
             target_distribution=target_distribution,
             source_uncertainty=source_uncertainty,
             target_uncertainty=target_uncertainty,
-            source_overlap_logits=self.overlap_head(source_final, matching[:, :-1, -1]),
-            target_overlap_logits=self.overlap_head(target_final, matching[:, -1, :-1]),
+            source_overlap_logits=self.overlap_head(
+                source_final, matching[:, :-1, -1], source_distribution.mean
+            ),
+            target_overlap_logits=self.overlap_head(
+                target_final, matching[:, -1, :-1], target_distribution.mean
+            ),
         )
 
 

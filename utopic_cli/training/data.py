@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from utopic_cli.bridge import to_cloud_input
+from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, prepare
 from utopic_cli.synthesis.pairs import PairSettings, ScanPair, random_pair
+from utopic_cli.training.hypotheses import draw_hypothesis
 from utopic_cli.training.network import TrainingPair
 
 if TYPE_CHECKING:
@@ -27,34 +29,54 @@ FAR = 1e3
 """Distance of a scanner at infinity, in extents."""
 
 
-def sample_pair(pair: ScanPair, points: int, known_views: bool = False) -> tuple[PreparedPair, np.ndarray]:
+class SampledPair(NamedTuple):
+    """A synthesised pair as the network is to see it, still as arrays.
+
+    Attributes:
+        prepared: the sampled pair.
+        gt_T_target_source: (4, 4) between the normalised clouds.
+        hypothesis: (4, 4) transformation under test.
+        hypothesis_present: 1.0 if the network is shown it, else 0.0.
+    """
+
+    prepared: PreparedPair
+    gt_T_target_source: np.ndarray
+    hypothesis: np.ndarray
+    hypothesis_present: float
+
+
+def sample_pair(pair: ScanPair, points: int, rng: np.random.Generator) -> SampledPair:
     """Sample a pair for the network, and take its known answer to normalised units.
 
-    With ``known_views`` normals face the scanner where it is known, which is always right;
-    without, their signs are found from the points alone, as at inference, with its mistakes.
+    For half of the pairs normals face the scanner where it is known, which is always right;
+    for the others their signs are found from the points alone, as at inference, with its
+    mistakes.
     """
     views = {}
-    if known_views:
+    if rng.random() < 0.5:
         views = {
-            f"{name}_viewpoint": None
-            if view is None
-            else cloud.points.mean(axis=0) + FAR * pair.extent * view
-            for name, cloud, view in (
-                ("source", pair.source, pair.source_viewpoint),
-                ("target", pair.target, pair.target_viewpoint),
-            )
+            "source_viewpoint": _far_away(pair.source, pair.source_viewpoint, pair.extent),
+            "target_viewpoint": _far_away(pair.target, pair.target_viewpoint, pair.extent),
         }
     prepared = prepare(pair.source, pair.target, points, **views)
-    return prepared, prepared.normalise(pair.gt_T_target_source)
+    gt = prepared.normalise(pair.gt_T_target_source)
+    return SampledPair(prepared, gt, *draw_hypothesis(prepared, gt, rng))
 
 
-def to_training_pair(prepared: PreparedPair, gt: np.ndarray, neighbours: int) -> TrainingPair:
-    """Return a sampled pair and its (4, 4) known answer as tensors, a batch of one."""
+def to_training_pair(pair: SampledPair, neighbours: int) -> TrainingPair:
+    """Return a sampled pair as tensors, a batch of one."""
     return TrainingPair(
-        to_cloud_input(prepared.source, prepared.spacing, neighbours),
-        to_cloud_input(prepared.target, prepared.spacing, neighbours),
-        torch.from_numpy(gt.astype(np.float32))[None],
+        to_cloud_input(pair.prepared.source, pair.prepared.spacing, neighbours),
+        to_cloud_input(pair.prepared.target, pair.prepared.spacing, neighbours),
+        torch.from_numpy(pair.gt_T_target_source.astype(np.float32))[None],
+        torch.from_numpy(pair.hypothesis.astype(np.float32))[None],
+        torch.tensor([pair.hypothesis_present], dtype=torch.float32),
     )
+
+
+def _far_away(cloud: PointCloud, direction: np.ndarray | None, extent: float) -> np.ndarray | None:
+    """Return a (3,) scanner position far off in a direction, or None where there is none."""
+    return None if direction is None else cloud.points.mean(axis=0) + FAR * extent * direction
 
 
 BLOCK = 64
@@ -71,7 +93,7 @@ class SynthesisedPairs(Dataset[TrainingPair]):
         """Draw from a library of shapes."""
         self.library, self.settings, self.seed, self.neighbours = library, settings, seed, neighbours
         # Arrays, not tensors: a tensor sent to another process keeps a file open.
-        self._made: OrderedDict[Key, tuple[PreparedPair, np.ndarray]] = OrderedDict()
+        self._made: OrderedDict[Key, SampledPair] = OrderedDict()
 
     def __getitem__(self, key: Key) -> TrainingPair:
         """Make a pair, or return it again if it was made within the last block."""
@@ -80,10 +102,10 @@ class SynthesisedPairs(Dataset[TrainingPair]):
             rng = np.random.default_rng([self.seed, number])
             points = int(rng.integers(fewest, most + 1))
             pair = random_pair(self.library, rng, self.settings)
-            self._made[key] = sample_pair(pair, points, known_views=rng.random() < 0.5)
+            self._made[key] = sample_pair(pair, points, rng)
             if len(self._made) > BLOCK:
                 self._made.popitem(last=False)
-        return to_training_pair(*self._made[key], self.neighbours)
+        return to_training_pair(self._made[key], self.neighbours)
 
 
 class PairKeys:

@@ -29,11 +29,15 @@ class TrainingPair(NamedTuple):
         source: (B, N) points each.
         target: (B, M) points each.
         gt_T_target_source: (B, 4, 4) float32 between the normalised clouds.
+        hypothesis: (B, 4, 4) transformation under test: right, nearly right or wrong.
+        hypothesis_present: (B,) 1 where the network is shown it, else 0.
     """
 
     source: CloudInput
     target: CloudInput
     gt_T_target_source: Tensor
+    hypothesis: Tensor
+    hypothesis_present: Tensor
 
 
 class LossWeights(NamedTuple):
@@ -76,7 +80,14 @@ class TrainingNetwork(nn.Module):
     ) -> dict[str, Tensor]:
         """Second stage: the whole network. Returns loss terms, not yet weighted."""
         labels = self.label(pair)
-        prediction = self.inference(pair.source, pair.target, generator=generator, masking=masking)
+        prediction = self.inference(
+            pair.source,
+            pair.target,
+            generator=generator,
+            masking=masking,
+            hypothesis=pair.hypothesis,
+            hypothesis_present=pair.hypothesis_present,
+        )
         temperature = self.log_temperature.exp()
         terms = {
             "descriptor": descriptor_loss(prediction.descriptor_similarity, temperature, labels),

@@ -263,15 +263,17 @@ def _averaged(config: TrainingConfig, average: dict[str, torch.Tensor]) -> Utopi
 def _validation_pairs(
     shapes: ShapeLibrary, settings: PairSettings, config: TrainingConfig
 ) -> list[TrainingPair]:
-    made = (
-        random_pair(shapes, np.random.default_rng([VALIDATION_SEED, number]), settings)
-        for number in range(config.schedule.validation_pairs)
-    )
-    return [to_training_pair(*sample_pair(pair, 768), config.model.neighbours) for pair in made]
+    made = []
+    for number in range(config.schedule.validation_pairs):
+        rng = np.random.default_rng([VALIDATION_SEED, number])
+        pair = random_pair(shapes, rng, settings)
+        made.append(to_training_pair(sample_pair(pair, 768, rng), config.model.neighbours))
+    return made
 
 
 def _to(pair: TrainingPair, device: torch.device) -> TrainingPair:
-    return TrainingPair(pair.source.to(device), pair.target.to(device), pair.gt_T_target_source.to(device))
+    source, target, *answers = pair
+    return TrainingPair(source.to(device), target.to(device), *(answer.to(device) for answer in answers))
 
 
 @contextmanager

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from utopic_cli.model.utopic import Utopic
-from utopic_cli.training.labels import POSITIVE_REACH, label_pair
+from utopic_cli.model.utopic import Prediction, Utopic
+from utopic_cli.training.labels import POSITIVE_REACH, Labels, label_pair
 from utopic_cli.training.network import TrainingPair
 
 
@@ -20,10 +20,12 @@ def validate(model: Utopic, pairs: Sequence[TrainingPair], seed: int) -> dict[st
         ``hit_rate``: share of overlapping source points whose most similar target descriptor
         lies within reach of the true place; ``match_rate``: the same for the final matching
         scores; ``inlier_ratio``: share of right ones among the 250 surest matches;
-        ``overlap_accuracy``: share of points whose overlap is told right at 0.5.
+        ``overlap_accuracy``: share of points whose overlap is told right at 0.5;
+        ``known_overlap_accuracy``: the same when shown the right transformation.
     """
     model.eval()
-    sums = {"hit_rate": 0.0, "match_rate": 0.0, "inlier_ratio": 0.0, "overlap_accuracy": 0.0}
+    names = ("hit_rate", "match_rate", "inlier_ratio", "overlap_accuracy", "known_overlap_accuracy")
+    sums = dict.fromkeys(names, 0.0)
     for number, pair in enumerate(pairs):
         generator = torch.Generator().manual_seed(seed + number)
         prediction = model(pair.source, pair.target, generator=generator)
@@ -39,10 +41,20 @@ def validate(model: Utopic, pairs: Sequence[TrainingPair], seed: int) -> dict[st
         order = surest.values.argsort(descending=True)[:250]
         right = error[order, surest.indices[order]] < 2.0 * POSITIVE_REACH
         sums["inlier_ratio"] += float(right.float().mean())
-        told = torch.cat([prediction.source_overlap[0] > 0.5, prediction.target_overlap[0] > 0.5])
-        known = torch.cat([labels.source_overlap[0] > 0.5, labels.target_overlap[0] > 0.5])
-        sums["overlap_accuracy"] += float((told == known).float().mean())
+        sums["overlap_accuracy"] += _overlap_accuracy(prediction, labels)
+        if model.config.hypothesis:
+            generator.manual_seed(seed + number)
+            prediction = model(
+                pair.source, pair.target, generator=generator, hypothesis=pair.gt_T_target_source
+            )
+        sums["known_overlap_accuracy"] += _overlap_accuracy(prediction, labels)
     return {name: value / max(len(pairs), 1) for name, value in sums.items()}
+
+
+def _overlap_accuracy(prediction: Prediction, labels: Labels) -> float:
+    told = torch.cat([prediction.source_overlap[0], prediction.target_overlap[0]]) > 0.5
+    known = torch.cat([labels.source_overlap[0], labels.target_overlap[0]]) > 0.5
+    return float((told == known).float().mean())
 
 
 def _match_errors(pair: TrainingPair) -> Tensor:
