@@ -14,7 +14,7 @@ class OverlapHead(nn.Module):
         super().__init__()
         self.linear = nn.Linear(width, 1)
         self.mass_gain = nn.Parameter(torch.tensor(0.5))
-        self.mean_gain = nn.Parameter(torch.tensor(0.0))
+        self.mean_gain = nn.Parameter(torch.tensor(1.0))
 
     def forward(self, features: Tensor, slack: Tensor, mean: Tensor) -> Tensor:
         """Return overlap logits.

@@ -27,17 +27,40 @@ class OverlapDistribution(NamedTuple):
 class UncertaintyQuantification(nn.Module):
     """Predict a Gaussian overlap per point, draw from it, take the variance (Eq. 8)."""
 
-    def __init__(self, width: int, scheme: str, samples: int) -> None:
-        """Build; ``scheme`` is ``sampled``, ``predicted`` or ``none`` (which still predicts the mean)."""
+    def __init__(self, width: int, scheme: str, samples: int, evidence: int = 0) -> None:
+        """Build.
+
+        Args:
+            width: channels of the features.
+            scheme: ``sampled``, ``predicted`` or ``none`` (which still predicts the mean).
+            samples: K.
+            evidence: channels of a hypothesis' evidence, which reaches mean and log-variance
+                directly; 0 without hypotheses.
+        """
         super().__init__()
         self.scheme, self.samples = scheme, samples
         self.mean = nn.Linear(width, 1)
         self.log_variance = nn.Linear(width, 1)
+        if evidence:
+            self.evidence = nn.Linear(evidence, 2, bias=False)
+            nn.init.zeros_(self.evidence.weight)
 
-    def forward(self, features: Tensor, generator: torch.Generator) -> OverlapDistribution:
-        """Quantify features (B, N, V); ``generator`` draws the K samples on the CPU."""
+    def forward(
+        self, features: Tensor, generator: torch.Generator, evidence: Tensor | None = None
+    ) -> OverlapDistribution:
+        """Quantify overlap.
+
+        Args:
+            features: (B, N, V).
+            generator: draws the K samples, on the CPU.
+            evidence: (B, N, E) of a hypothesis, or None.
+        """
         mean = self.mean(features).squeeze(-1).float()
-        log_variance = self.log_variance(features).squeeze(-1).float().clamp(-8.0, 4.0)
+        log_variance = self.log_variance(features).squeeze(-1).float()
+        if evidence is not None:
+            shift = self.evidence(evidence).float()
+            mean, log_variance = mean + shift[..., 0], log_variance + shift[..., 1]
+        log_variance = log_variance.clamp(-8.0, 4.0)
         # Points share their draws at inference: each point's samples have the same distribution,
         # but K draws of its own would speckle the variance by a fifth.
         shape = (mean.shape[0], self.samples, mean.shape[1] if self.training else 1)

@@ -75,7 +75,10 @@ class Utopic(nn.Module):
         self.first_transformer = GeometryTransformer(config)
         self.first_matching = AffinityMatching(width, config.sinkhorn_iterations, config.descriptor_skip)
         self.quantification = UncertaintyQuantification(
-            width, config.uncertainty_scheme, config.uncertainty_samples
+            width,
+            config.uncertainty_scheme,
+            config.uncertainty_samples,
+            HYPOTHESIS_FEATURES if config.hypothesis else 0,
         )
         self.weighting = UncertaintyWeighting(width)
         self.second_transformer = GeometryTransformer(config)
@@ -116,19 +119,18 @@ class Utopic(nn.Module):
         where = (source.points, target.points, source_embedding, target_embedding)
 
         source_known, target_known = source_features, target_features
+        source_evidence = target_evidence = None
         if hypothesis is not None and self.config.hypothesis:
             if hypothesis_present is None:
                 hypothesis_present = torch.ones(len(hypothesis), device=hypothesis.device)
-            source_known = source_features + self.hypothesis(
-                hypothesis_features(source, target, hypothesis, hypothesis_present)
-            )
-            target_known = target_features + self.hypothesis(
-                hypothesis_features(target, source, inverse(hypothesis), hypothesis_present)
-            )
+            source_evidence = hypothesis_features(source, target, hypothesis, hypothesis_present)
+            target_evidence = hypothesis_features(target, source, inverse(hypothesis), hypothesis_present)
+            source_known = source_features + self.hypothesis(source_evidence)
+            target_known = target_features + self.hypothesis(target_evidence)
         source_hybrid, target_hybrid = self.first_transformer(source_known, target_known, *where)
         coarse = self.first_matching(source_hybrid, target_hybrid, similarity)
-        source_distribution = self.quantification(source_hybrid, generator)
-        target_distribution = self.quantification(target_hybrid, generator)
+        source_distribution = self.quantification(source_hybrid, generator, source_evidence)
+        target_distribution = self.quantification(target_hybrid, generator, target_evidence)
         source_uncertainty, target_uncertainty = normalise_uncertainty(
             source_distribution.raw_uncertainty, target_distribution.raw_uncertainty
         )

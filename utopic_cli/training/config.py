@@ -33,7 +33,7 @@ class Schedule:
         optimiser: ``adamw`` or ``sgd`` (Nesterov momentum 0.9).
         descriptor_rate: highest learning rate of the first stage.
         joint_rate: highest learning rate of the second stage.
-        matching_rate: factor on the rate of the affinity's gain and bias.
+        matching_rate: factor on the rate of gains and biases (``trainer.FAST``).
         weight_decay: decoupled weight decay.
         clip: largest gradient norm.
         masking_from: share of the joint stage after which random masking starts.

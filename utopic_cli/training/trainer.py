@@ -30,6 +30,15 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[dict[str, Any]], None]
 VALIDATION_SEED = 900_001
+FAST = (
+    "matching.gain",
+    "matching.bias",
+    "matching.skip_gain",
+    "quantification.evidence.weight",
+    "overlap_head.mass_gain",
+    "overlap_head.mean_gain",
+)
+"""Parameters whose rate is multiplied by the schedule's ``matching_rate``."""
 
 
 class DivergedError(UtopicError):
@@ -219,11 +228,11 @@ def _points_of(sample: int, schedule: Schedule) -> tuple[int, int]:
 
 
 def _optimiser(network: TrainingNetwork, schedule: Schedule) -> torch.optim.Optimizer:
-    """Build the optimiser; the affinity's gains and bias learn faster than the rest."""
+    """Build the optimiser; the few numbers that weigh whole kinds of evidence learn faster than the rest."""
     fast: list[torch.nn.Parameter] = []
     normal: list[torch.nn.Parameter] = []
     for name, parameter in network.named_parameters():
-        is_fast = name.endswith(("matching.gain", "matching.bias", "matching.skip_gain"))
+        is_fast = name.endswith(FAST)
         (fast if is_fast else normal).append(parameter)
     groups = [
         {"params": normal, "factor": 1.0, "weight_decay": schedule.weight_decay},
