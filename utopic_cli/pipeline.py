@@ -19,7 +19,6 @@ from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.solver import Estimate, Problem, solve
 from utopic_cli.estimation.surface import point_spacing
 from utopic_cli.estimation.verification import measure_fit
-from utopic_cli.geometry import rigid
 from utopic_cli.io.scan import read_scan
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import choose_device, load_weights
@@ -37,6 +36,9 @@ CLEAR_SCORE = 0.15
 
 CLEAR_OUTWARDNESS = 0.1
 """Normals that point outwards less clearly than this (a flat sheet's) may have either side."""
+
+RIVAL_SHARE = 0.85
+"""A distinct pose with more than this share of the best one's score is named as a rival."""
 
 COUNTERPART_REACH = 3.0
 """A point has a counterpart within this many spacings of the sparser scan."""
@@ -144,13 +146,8 @@ def register(
     clock.start("measure")
     correspondences = _in_original_points(estimate.correspondences, prepared)
     threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
-    fit = measure_fit(
-        source,
-        target,
-        transformation,
-        threshold,
-        correspondence_residuals=_residuals(source, target, correspondences, transformation),
-    )
+    fit = replace(measure_fit(source, target, transformation, threshold), inlier_ratio=estimate.support)
+    rivals = [rival for rival in estimate.rivals if rival.score > RIVAL_SHARE * estimate.score]
     clock.start("carry to all points")
     source_all = _carry(source, prepared.source_centre, prepared.scale, prepared.source.points,
                         view.source_overlap, view.source_uncertainty)  # fmt: skip
@@ -161,7 +158,7 @@ def register(
         confidence=None,
         trusted=None,
         reasons=("these weights carry no calibration, so there is no verdict on this result",),
-        ambiguous_with=tuple(prepared.denormalise(rival.T_target_source) for rival in estimate.rivals),
+        ambiguous_with=tuple(prepared.denormalise(rival.T_target_source) for rival in rivals),
         source_overlap=source_all[:, 0],
         target_overlap=target_all[:, 0],
         source_uncertainty=source_all[:, 1],
@@ -170,7 +167,7 @@ def register(
         correspondences=correspondences,
         fit=fit,
         timings_s=clock.stop(),
-        warnings=_warnings(source, target),
+        warnings=_warnings(source, target, len(rivals)),
         weights_name=str(card["name"]),
         weights_sha256=str(card["sha256"]),
         options=asdict(options),
@@ -290,14 +287,6 @@ def _in_original_points(nodes: Correspondences, prepared: PreparedPair) -> Corre
     )
 
 
-def _residuals(
-    source: PointCloud, target: PointCloud, pairs: Correspondences, transformation: np.ndarray
-) -> np.ndarray:
-    """Return the (K,) distances of the correspondences under a transformation, in file units."""
-    moved = rigid.apply(transformation, source.points[pairs.source_indices])
-    return np.linalg.norm(moved - target.points[pairs.target_indices], axis=1)
-
-
 def _carry(
     cloud: PointCloud,
     centre: np.ndarray,
@@ -321,12 +310,19 @@ def _summary(view: NetworkView) -> dict[str, float]:
     }
 
 
-def _warnings(source: PointCloud, target: PointCloud) -> tuple[str, ...]:
+def _warnings(source: PointCloud, target: PointCloud, rivals: int) -> tuple[str, ...]:
+    """Say what a user should know beyond the numbers."""
+    warnings = []
+    if rivals:
+        poses = "another pose fits" if rivals == 1 else f"{rivals} other poses fit"
+        warnings.append(f"{poses} nearly as well (symmetry, or too little overlap): see ambiguous_with")
     extents = [float(np.linalg.norm(np.ptp(cloud.points, axis=0))) for cloud in (source, target)]
     ratio = max(extents) / min(extents)
-    if ratio < UNIT_MISMATCH:
-        return ()
-    return (f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?",)
+    if ratio >= UNIT_MISMATCH:
+        warnings.append(
+            f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?"
+        )
+    return tuple(warnings)
 
 
 def _array(batch: torch.Tensor) -> np.ndarray:
