@@ -5,6 +5,7 @@ Everything heavy is imported inside the commands, so that ``--help`` is instant.
 
 from __future__ import annotations
 
+import signal
 import sys
 import traceback
 from typing import Annotated, Any
@@ -24,7 +25,7 @@ from utopic_cli.errors import UtopicError
 # Usage errors are Typer's own to print. Their base class has moved between Typer's versions
 # (click, then a copy of it), so it is taken from a class that is exported by all of them.
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
-_PASSED_ON = (typer.Exit, typer.Abort, _USAGE_ERROR, BrokenPipeError)
+_PASSED_ON = (typer.Exit, typer.Abort, _USAGE_ERROR)
 
 
 class Door(TyperGroup):
@@ -41,6 +42,8 @@ class Door(TyperGroup):
             raise
         except KeyboardInterrupt:
             _leave(ctx, "interrupted", 130)
+        except BrokenPipeError:
+            _leave(ctx, "error: the output can't be written: whoever read it is gone", 5)
         except UtopicError as error:
             _leave(ctx, f"error: {_one_line(error)}", error.exit_code)
         except Exception as error:
@@ -101,6 +104,8 @@ app.add_typer(bench, name="bench")
 
 def main() -> None:
     """Entry point of the ``utopic`` command."""
+    # Asked to end by a scheduler or ``timeout``: tidy up as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     app(prog_name="utopic")
 
 

@@ -1,7 +1,7 @@
 """The JSON report of one registration: everything a later reader or program needs to know.
 
 ``report.json`` is a promise, versioned by ``schema_version``: keys are added, not renamed.
-What this version does not measure yet is null, never left out or guessed.
+What this version does not measure yet is null, never left out or guessed; ``not_measured`` says why.
 """
 
 from __future__ import annotations
@@ -16,10 +16,14 @@ from scipy.spatial.transform import Rotation
 from utopic_cli import __version__
 from utopic_cli.geometry.rigid import apply, rotation_angle_deg
 from utopic_cli.io.scan import Scan
+from utopic_cli.io.transformation import CONVENTION
 from utopic_cli.result import RegistrationResult
 
 SCHEMA_VERSION = 1
-CONVENTION = "p_target = T_target_source @ p_source"
+NOT_MEASURED = {
+    "unobservable": "this version does not look for axes that the geometry leaves free",
+    "covariance": "this version does not estimate the (6, 6) covariance",
+}
 
 
 def build_report(
@@ -61,6 +65,7 @@ def build_report(
         "residual_threshold": result.fit.threshold,
         "unobservable": None,
         "covariance": None,
+        "not_measured": NOT_MEASURED,
         "overlap": {
             "source": _distribution(result.source_overlap),
             "target": _distribution(result.target_overlap),

@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import errno
+import io
 import os
+import sys
 
 import numpy as np
 import pytest
 
 from utopic_cli.commands import outputs
+from utopic_cli.commands.align import _to_stdout
+from utopic_cli.errors import OutputError
 
 HEADER = (
     "ply\nformat ascii 1.0\nelement vertex {}\n"
@@ -119,6 +124,16 @@ def test_an_output_that_cant_be_written_exits_5_before_any_work(
     assert_one_line(result, str(folder))
 
 
+@pytest.mark.parametrize("option", ["--clouds", "--out-dir"])
+def test_a_folder_that_is_a_link_to_nothing_exits_5_before_any_work(
+    cli, fake, scans, tmp_path, no_reading, option
+):
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    result = cli("align", *scans, option, tmp_path / "link")
+    assert result.exit_code == 5, result.output
+    assert_one_line(result, "link to nothing")
+
+
 @pytest.mark.parametrize("option", OUTPUT_OPTIONS)
 def test_existing_files_are_refused_and_with_overwrite_replaced(cli, fake, scans, tmp_path, option):
     path = tmp_path / OUTPUT_OPTIONS[option]
@@ -176,24 +191,52 @@ def test_bad_options_exit_2(cli, fake, scans, tmp_path, no_reading, monkeypatch,
     assert snapshot(tmp_path) == before
 
 
-def test_when_one_file_cant_be_written_the_new_ones_go_again(cli, fake, scans, tmp_path, monkeypatch):
-    from utopic_cli.errors import OutputError
-    from utopic_cli.io import output
+@pytest.fixture
+def full_disk(monkeypatch):
+    """Let the disk run full at the sixth file flushed to it."""
+    flushed = []
 
-    write = output.write_atomically
+    def fsync(_):
+        flushed.append(True)
+        if len(flushed) == 6:
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-    def full_disk(path, data, *, overwrite):
-        if path.name == "source_uncertainty.ply":
-            raise OutputError(f"{path}: No space left on device")
-        return write(path, data, overwrite=overwrite)
+    monkeypatch.setattr(os, "fsync", fsync)
 
-    monkeypatch.setattr(output, "write_atomically", full_disk)
+
+def test_when_one_file_cant_be_written_the_new_ones_go_again(cli, fake, scans, tmp_path, full_disk):
     before = snapshot(tmp_path)
     result = cli("align", *scans, "--out-dir", tmp_path / "out", "-o", tmp_path / "T.txt")
     assert result.exit_code == 5
-    assert_one_line(result, "source_uncertainty.ply", "No space left")
+    assert_one_line(result, "source_uncertainty.ply", "disk is full")
     assert snapshot(tmp_path) == before
     assert not (tmp_path / "out").exists()
+
+
+def test_an_old_set_stays_whole_when_the_new_one_cant_be_written(cli, fake, scans, tmp_path, full_disk):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("transformation.txt", "aligned.ply", "source_overlap.ply", "report.json"):
+        (out / name).write_text("precious")
+    before = snapshot(out)
+    assert cli("align", *scans, "--out-dir", out, "--overwrite").exit_code == 5
+    assert snapshot(out) == before
+
+
+def test_an_interrupt_between_two_files_leaves_nothing(cli, fake, scans, tmp_path, monkeypatch):
+    linked, link = [], os.link
+
+    def interrupted(*places):
+        linked.append(places)
+        if len(linked) == 3:
+            raise KeyboardInterrupt
+        link(*places)
+
+    monkeypatch.setattr(os, "link", interrupted)
+    before = snapshot(tmp_path)
+    assert cli("align", *scans, "--clouds", tmp_path / "out", "-o", tmp_path / "T.txt").exit_code == 130
+    assert len(linked) == 3
+    assert snapshot(tmp_path) == before
 
 
 def test_a_bug_of_ours_is_one_line_and_exit_1_and_debug_shows_where(cli, fake, scans):
@@ -213,6 +256,18 @@ def test_an_interrupt_exits_130_and_leaves_nothing(cli, fake, scans, tmp_path):
     assert result.exit_code == 130
     assert_one_line(result, "interrupted")
     assert not (tmp_path / "out").exists()
+
+
+class NobodyReads(io.StringIO):
+    def write(self, text):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+
+@pytest.mark.parametrize("stdout", [None, NobodyReads()])
+def test_a_matrix_that_nobody_reads_is_an_output_that_cant_be_written(monkeypatch, stdout):
+    monkeypatch.setattr(sys, "stdout", stdout)
+    with pytest.raises(OutputError, match=r"stdout: .*-o"):
+        _to_stdout(b"1 0 0 0\n")
 
 
 def test_identity_sees_through_names(tmp_path):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from typing import get_args, get_type_hints
 
@@ -71,21 +72,19 @@ def test_the_transformation_file_has_the_format_of_its_suffix(cli, fake, scans, 
 
 
 def test_the_whole_set(cli, fake, scans, tmp_path, monkeypatch):
-    from utopic_cli.io import output
+    order, link = [], os.link
 
-    order = []
-    write = output.write_atomically
-
-    def recorded(path, data, *, overwrite):
+    def recorded(temporary, path):
         order.append(path.name)
-        return write(path, data, overwrite=overwrite)
+        link(temporary, path)
 
-    monkeypatch.setattr(output, "write_atomically", recorded)
+    monkeypatch.setattr(os, "link", recorded)
     out = tmp_path / "out"
     result = cli("align", *scans, "--out-dir", out)
     assert result.exit_code == 0, result.stderr
     assert result.stdout == ""
     assert {path.name for path in out.iterdir()} == WHOLE_SET
+    assert len(order) == len(WHOLE_SET)
     assert order[-1] == "report.json"
     moved = xyz(read_points(out / "aligned.ply"))
     source = xyz(read_points(scans[0]))
@@ -135,6 +134,8 @@ def test_the_report_says_everything_promised(cli, fake, scans, tmp_path):
     assert report["schema_version"] == 1
     assert report["convention"] == "p_target = T_target_source @ p_source"
     assert report["confidence"] is None
+    assert all(report[name] is None and why for name, why in report["not_measured"].items())
+    assert {"covariance", "unobservable"} == set(report["not_measured"])
     assert report["T_target_source"] == QUARTER_TURN.tolist()
     assert report["source"]["points"] == 60
     assert report["target"]["path"] == str(scans[1])

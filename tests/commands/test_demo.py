@@ -51,6 +51,13 @@ def test_a_wrong_answer_is_called_what_it_is(cli, fake, tmp_path, pair):
     assert "error    180.000 degrees" in cli("demo", "--out-dir", tmp_path / "d").stderr
 
 
+def test_a_demo_that_fails_leaves_nothing(cli, fake, tmp_path):
+    fake.raises = KeyboardInterrupt()
+    assert cli("demo", "--out-dir", tmp_path / "d").exit_code == 130
+    assert fake.calls
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_existing_demo_is_replaced_only_if_told(cli, fake, tmp_path):
     (tmp_path / "report.json").write_text("precious")
     refused = cli("demo", "--out-dir", tmp_path)

@@ -16,6 +16,7 @@ def test_info_says_versions_devices_and_the_weights_hash(cli, monkeypatch):
     assert facts["versions"]["utopic-cli"] == utopic_cli.__version__
     assert facts["versions"]["torch"][0].isdigit()
     assert "cpu" in facts["devices"]
+    assert facts["weights"]
     for name, path in bundled_weights().items():
         assert facts["weights"][name]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
         assert facts["weights"][name]["intact"] is True

@@ -43,8 +43,9 @@ def test_options_reach_the_trainer(cli, trainer, tmp_path):
     assert str(out / "utopic.safetensors") in result.stderr
 
 
-def test_a_run_that_is_there_is_not_overwritten(cli, trainer, tmp_path):
-    (tmp_path / "checkpoint.pt").write_bytes(b"hours of work")
+@pytest.mark.parametrize("name", ["checkpoint.pt", "utopic.safetensors", "utopic.json"])
+def test_a_run_that_is_there_is_not_overwritten(cli, trainer, tmp_path, name):
+    (tmp_path / name).write_bytes(b"hours of work")
     result = cli("train", "--out", tmp_path)
     assert result.exit_code == 5
     assert "--resume" in result.stderr
@@ -71,9 +72,13 @@ def test_procedural_shapes_are_the_same_every_time(monkeypatch):
     assert (first.vertices == second.vertices).all()
 
 
-def test_out_must_be_a_folder(cli, trainer, tmp_path):
+@pytest.mark.parametrize("place", ["file", "file/run", "file/deeper/run"])
+def test_out_must_be_a_folder(cli, trainer, tmp_path, place):
     (tmp_path / "file").write_text("")
-    assert cli("train", "--out", Path(tmp_path, "file")).exit_code == 5
+    result = cli("train", "--out", Path(tmp_path, place))
+    assert result.exit_code == 5, result.output
+    assert len(result.stderr.splitlines()) == 1
+    assert not trainer
 
 
 def test_a_record_is_one_line():

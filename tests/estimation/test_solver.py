@@ -63,6 +63,18 @@ def test_an_initial_transformation_decides_where_the_scores_say_nothing(
     assert_right(estimate.T_target_source, gt_transformation)
 
 
+def test_an_assignment_without_a_rotation_leaves_the_others_to_answer(
+    hard_problem: Problem, gt_transformation: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def collinear(*_: np.ndarray) -> np.ndarray:
+        raise ValueError("the correspondences lie on one line or point: no unique rotation")
+
+    monkeypatch.setattr("utopic_cli.estimation.solver.weighted_procrustes", collinear)
+    assert_right(solve(hard_problem).T_target_source, gt_transformation)
+    with pytest.raises(ValueError, match="no transformation"):
+        solve(hard_problem, "svd")
+
+
 def test_same_input_same_bits(hard_problem: Problem, automatic: Estimate) -> None:
     first, second = automatic, solve(hard_problem)
     assert np.array_equal(first.T_target_source, second.T_target_source)

@@ -86,6 +86,7 @@ def glb(description: dict) -> bytes:
         ("stl", b"short", "too short"),
         ("off", b"OFF\n4000000000 7 0\n0 0 0\n", "promises 4000000000 vertices"),
         ("off", b"hello", "does not start like an OFF"),
+        ("off", b"OFF\n" + b" #" * 60 + b" x", "does not start like an OFF"),
         ("off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n", "vertices that do not exist|can't be read"),
         ("off", b"OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 2\n", "without any area"),
         ("glb", b"glTF" + b"\0" * 3, "does not start like a GLB"),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,11 +24,10 @@ from utopic_cli.errors import InputError, UsageError, UtopicError
 from utopic_cli.geometry.normals import estimate_normals, orient_normals
 from utopic_cli.geometry.rigid import apply
 from utopic_cli.geometry.voxel import voxel_downsample
+from utopic_cli.io.colour import SOURCE_COLOUR, TARGET_COLOUR
 from utopic_cli.io.output import write_atomically
 from utopic_cli.io.transformation import read_transformation
 
-SOURCE_COLOUR = (230, 159, 0)  # orange and blue: told apart by colour-blind eyes too
-TARGET_COLOUR = (0, 114, 178)
 OVERSAMPLING = 2
 _LIGHT = np.array([-0.35, 0.45, 0.82])  # from the upper left, in view coordinates
 _PLY_TYPES = {"double": "<f8", "float": "<f4", "uchar": "u1"}
@@ -106,9 +106,8 @@ def facing_view(points: np.ndarray, roll_deg: float = 0.0, turn_deg: float = 0.0
     normals = orient_normals(thinned, estimate_normals(thinned))
     towards = normals.mean(axis=0)
     length = float(np.linalg.norm(towards))
-    towards = (
-        towards / length if length > 0.02 else np.array([0.0, 0.0, 1.0])
-    )  # a closed surface faces nowhere
+    # A closed surface faces nowhere.
+    towards = towards / length if length > 0.02 else np.array([0.0, 0.0, 1.0])
     across = (thinned - thinned.mean(axis=0)) @ (np.eye(3) - np.outer(towards, towards))
     up = np.linalg.svd(across, full_matrices=False)[2][0]
     up = up - (up @ towards) * towards
@@ -250,4 +249,5 @@ if __name__ == "__main__":
     try:
         main()
     except UtopicError as error:
-        raise SystemExit(f"utopic: error: {error}") from error
+        sys.stderr.write(f"utopic: error: {error}\n")
+        raise SystemExit(error.exit_code) from None

@@ -129,7 +129,7 @@ def run_methods(
         "methods": {method.name: method.settings() for method in methods},
         "versions": _versions(),
     }
-    read = lru_cache(maxsize=8)(lambda path: read_scan(path))
+    read = lru_cache(maxsize=8)(read_scan)
     chosen = _choose(read_ground_truth(directory), read, pairs, min_overlap)
     total = len(chosen) * poses * len(methods)
     attempts: list[Attempt] = []

@@ -126,12 +126,13 @@ class Report:
 
 def render(report: Report, console: Console) -> None:
     """Print the table by overlap band, and the failures that raised an exception."""
+    from rich.markup import escape
     from rich.table import Table
 
     settings = report.settings
     tried = len({attempt.pair for attempt in report.attempts})
     table = Table(
-        title=f"scans: {settings['directory']} - {tried} pairs x {settings['poses']} start poses, "
+        title=f"scans: {escape(settings['directory'])} - {tried} pairs x {settings['poses']} start poses, "
         f"seed {settings['seed']}",
         caption=f"success: RRE < {MAX_RRE_DEG:g} deg and RTE < {MAX_RTE_SHARE:.0%} of the extent, "
         "RTE at the source's centroid; overlap of the smaller side",

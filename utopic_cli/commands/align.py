@@ -209,7 +209,8 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
         OutputError: an output can't be written; found before any work wherever that can be known.
         InputError: a scan, the initial transformation or the weights can't be used.
     """
-    inputs = [request.source, request.target, Path(request.options.weights)]
+    weights = Path(request.options.weights)
+    inputs = [request.source, request.target, weights, weights.parent / f"{weights.stem}.json"]
     check_outputs(request.plan, [*inputs, *([request.init] if request.init else [])], request.overwrite)
     with console.progress() as progress:
         progress("loading libraries")
@@ -268,10 +269,10 @@ def _verdict(result: RegistrationResult) -> str:
 
 
 def _to_stdout(data: bytes) -> None:
+    if sys.stdout is None:  # closed by whoever started this process
+        raise OutputError("stdout: can't be written: it is closed; name a file with -o")
     try:
         sys.stdout.write(data.decode("ascii"))
         sys.stdout.flush()
-    except BrokenPipeError:
-        raise
     except OSError as error:
-        raise OutputError(f"stdout: can't be written: {error.strerror}") from error
+        raise OutputError(f"stdout: can't be written: {error.strerror}; name a file with -o") from error

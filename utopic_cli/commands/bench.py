@@ -77,12 +77,12 @@ def scans(
             options=AlignOptions(weights=weights, device=device, threads=threads, seed=seed),
             progress=_countdown(step),
         )
+    if json_out is not None:  # before anything that stdout could spoil
+        write_atomically(json_out, report.to_json().encode("utf-8"), overwrite=overwrite)
+        console.line(f"wrote {json_out}")
     from rich.console import Console as RichConsole
 
     render(report, RichConsole())
-    if json_out is not None:
-        write_atomically(json_out, report.to_json().encode("utf-8"), overwrite=overwrite)
-        console.line(f"wrote {json_out}")
 
 
 def _countdown(step: Callable[[str], None]) -> Callable[[int, int, str], None]:

@@ -13,6 +13,7 @@ _DEBUG = "utopic_cli.debug"
 
 SOLVING = "How to align"
 RUNNING = "How to run"
+SECONDS_BETWEEN_LINES = 10.0  # of progress, where stderr is a file or a pipe
 
 
 def debug_wanted(ctx: Any) -> bool:
@@ -48,7 +49,7 @@ Device = Annotated[
 ]
 Threads = Annotated[
     int,
-    typer.Option(min=0, help="CPU threads; 0: as many as there are cores.", rich_help_panel=RUNNING),
+    typer.Option(min=0, help="CPU threads; 0: the library's choice.", rich_help_panel=RUNNING),
 ]
 Seed = Annotated[
     int,
@@ -79,7 +80,7 @@ class Console:
     def line(self, text: str = "") -> None:
         """Write one line, unless quiet."""
         if not self.quiet:
-            self._rich.print(text, markup=False, soft_wrap=True)
+            self._rich.print(" ".join(text.splitlines()), markup=False, soft_wrap=True)
 
     def detail(self, text: str) -> None:
         """Write one line if verbose."""
@@ -89,17 +90,17 @@ class Console:
     def warnings(self, texts: tuple[str, ...]) -> None:
         """Write warnings, one line each."""
         for text in texts:
-            self.line(f"utopic: warning: {' '.join(text.splitlines())}")
+            self.line(f"utopic: warning: {text}")
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str], None]]:
-        """Show the step at work while the block runs, on a terminal only.
+        """Show the step at work while the block runs; where there is no terminal, a line now and then.
 
         Yields:
             A function to call with the name of each step as it begins.
         """
         if self.quiet or not self._rich.is_terminal:
-            yield lambda step: None
+            yield self._now_and_then()
             return
         from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -109,6 +110,17 @@ class Console:
         ) as bar:
             task = bar.add_task("starting", total=None)
             yield lambda step: bar.update(task, description=step)
+
+    def _now_and_then(self) -> Callable[[str], None]:
+        said = time.monotonic()
+
+        def progress(step: str) -> None:
+            nonlocal said
+            if time.monotonic() - said >= SECONDS_BETWEEN_LINES:
+                said = time.monotonic()
+                self.line(f"  {step}")
+
+        return progress
 
 
 @contextmanager

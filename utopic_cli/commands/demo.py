@@ -65,7 +65,6 @@ def demo(
             source: _scan_file(pair.source.points, "source"),
             target: _scan_file(pair.target.points, "target"),
         }
-    write_outputs(scans, contents, overwrite)
     request = AlignRequest(
         source=source,
         target=target,
@@ -73,7 +72,9 @@ def demo(
         options=AlignOptions(weights=weights, device=device, threads=threads, seed=seed),
         overwrite=overwrite,
     )
-    outcome = run(request, console)
+    with write_outputs(scans, contents, overwrite) as undo:  # without an answer the scans go again
+        outcome = run(request, console)
+        undo.pop_all()
     _say_error(outcome, pair, console)
     console.line(f"look at {out_dir / 'aligned.ply'} together with {target} in any viewer;")
     console.line(

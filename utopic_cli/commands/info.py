@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from utopic_cli.commands.console import Debug
+from utopic_cli.commands.console import Console, Debug
 
-REQUIRED = ("torch", "numpy", "scipy", "safetensors", "small_gicp", "trimesh", "typer", "rich")
+REQUIRED = ("torch", "numpy", "scipy", "safetensors", "trimesh", "typer", "rich")
 OPTIONAL = {
     "open3d": "baselines of 'utopic bench'; needs system libraries: "
     "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1",
@@ -21,7 +21,9 @@ def info(
     debug: Debug = False,
 ) -> None:
     """Print versions, devices, the bundled weights with their hash, and what optional parts are there."""
-    facts = collect()
+    with Console().progress() as progress:
+        progress("loading libraries")
+        facts = collect()
     if json_report:
         import json
 
@@ -31,6 +33,8 @@ def info(
         typer.echo(section)
         for name, value in entries.items():
             typer.echo(f"  {name:<14} {value if not isinstance(value, dict) else _lines(value)}")
+        if not entries:
+            typer.echo("  none")
 
 
 def collect() -> dict[str, dict[str, Any]]:
@@ -74,7 +78,7 @@ def _optional(name: str) -> str:
         return f"{version} ({OPTIONAL[name]})"
     try:
         import_module(name)
-    except (ImportError, OSError) as error:
+    except Exception as error:  # whatever it meets: libraries it lacks, another NumPy
         return f"{version}, can't be loaded: {' '.join(str(error).split())} ({OPTIONAL[name]})"
     return version
 

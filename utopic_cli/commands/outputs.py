@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,6 +105,8 @@ def check_outputs(plan: OutputPlan, inputs: Iterable[Path], overwrite: bool) -> 
         seen.add(identity)
     missing = [folder for folder in plan.folders if not folder.exists()]
     for folder in missing:
+        if folder.is_symlink():
+            raise OutputError(f"{folder}: is a link to nothing; make the folder it names, or name another")
         if not folder.parent.is_dir():
             raise OutputError(f"{folder}: the folder {folder.parent} does not exist; make it first")
         if not os.access(folder.parent, os.W_OK | os.X_OK):
@@ -178,37 +181,35 @@ def coloured_cloud(kind: str, source: Scan, target: Scan, result: RegistrationRe
     return scalar_cloud_ply(scan.cloud.points, colour_map(fields[shown]), fields, comments)
 
 
-def write_outputs(plan: OutputPlan, contents: dict[Path, bytes], overwrite: bool) -> None:
-    """Write all files, the report last; if one can't be written, the new ones go again.
+def write_outputs(plan: OutputPlan, contents: dict[Path, bytes], overwrite: bool) -> ExitStack:
+    """Write all files or none, the report last.
+
+    Returns:
+        What takes the new files and folders away again when it is closed, for callers whose
+        files are worth nothing should a later step fail. Others let it go.
 
     Raises:
         OutputError: a folder can't be made or a file can't be written.
     """
-    from utopic_cli.io.output import write_atomically
+    from utopic_cli.io.output import write_together
 
-    made: list[Path] = []
-    written: list[Path] = []
-    try:
+    with ExitStack() as undo:
         for folder in plan.folders:
             if not folder.exists():
                 _make_folder(folder)
-                made.append(folder)
-        for path, data in contents.items():
-            new = not path.exists()
-            write_atomically(path, data, overwrite=overwrite)
-            if new:
-                written.append(path)
-    except BaseException:
-        for path in written:
-            path.unlink(missing_ok=True)
-        for folder in reversed(made):
-            if not any(folder.iterdir()):
-                folder.rmdir()
-        raise
+                undo.callback(_remove_if_empty, folder)
+        for path in write_together(contents, overwrite=overwrite):
+            undo.callback(path.unlink, missing_ok=True)
+        return undo.pop_all()
 
 
 def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder}: can't be made: {error.strerror}") from error
+        raise OutputError(f"{folder}: can't be made: {error.strerror}; choose another place") from error
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()

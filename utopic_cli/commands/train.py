@@ -13,6 +13,7 @@ from utopic_cli.errors import OutputError
 if TYPE_CHECKING:
     from utopic_cli.synthesis.shapes import ShapeLibrary
 
+RUN_FILES = ("checkpoint.pt", "utopic.safetensors", "utopic.json")
 PROCEDURAL = "procedural"
 PROCEDURAL_SHAPES = 240
 PROCEDURAL_SEED = 20221015  # another stream than any training seed; the shapes are always the same
@@ -50,10 +51,7 @@ def train(
 
     Checkpoints survive a kill: run the same command with --resume to go on.
     """
-    if not resume and (out / "checkpoint.pt").exists():
-        raise OutputError(f"{out}: holds a run already; go on with --resume, or name another folder")
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"{out}: is not a folder")
+    check_run(out, resume)
     console = Console(quiet=quiet)
     from utopic_cli.model.weights import choose_device, load_weights
     from utopic_cli.training.config import read_training_config
@@ -79,6 +77,25 @@ def train(
     )
     console.line(f"wrote {written}")
     console.line(f"use it: utopic align SOURCE TARGET --weights {written}")
+
+
+def check_run(out: Path, resume: bool) -> None:
+    """Refuse, before any work, a folder that can't be written or holds another run.
+
+    Raises:
+        OutputError: it is no folder, can't be made or written, or holds what a run leaves.
+    """
+    from utopic_cli.io.output import check_writable
+
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out}: is not a folder; name another place")
+    held = [name for name in RUN_FILES if (out / name).exists()]
+    if held and not resume:
+        raise OutputError(
+            f"{out}: holds a run already ({held[0]}); go on with --resume, or name another folder"
+        )
+    there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    check_writable([there / RUN_FILES[0]], overwrite=True)
 
 
 def load_library(data: str) -> ShapeLibrary:

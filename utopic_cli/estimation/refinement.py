@@ -249,9 +249,10 @@ def _residual(moving: _FullSurface, fixed: _FullSurface, T: np.ndarray, threshol
 
 
 def _one_way(points: np.ndarray, surface: _FullSurface, threshold: float) -> float:
-    distance, index = surface.tree.query(thinned(points, 20_000), distance_upper_bound=threshold)
+    points = thinned(points, 20_000)
+    distance, index = surface.tree.query(points, distance_upper_bound=threshold)
     near = np.isfinite(distance)
     residual = np.full(len(distance), threshold)
-    offset = surface.points[index[near]] - thinned(points, 20_000)[near]
+    offset = surface.points[index[near]] - points[near]
     residual[near] = np.abs(np.einsum("nd,nd->n", offset, surface.normals[index[near]]))
     return float(residual.mean())

@@ -215,11 +215,13 @@ def _assignment(problem: Problem) -> Correspondences:
 
 def _assignment_hypothesis(problem: Problem) -> list[Hypothesis]:
     pairs = _assignment(problem)
-    if np.count_nonzero(pairs.weights) < 3:
-        return []
     source = problem.source_nodes[pairs.source_indices]
     target = problem.target_nodes[pairs.target_indices]
-    return [Hypothesis(weighted_procrustes(source, target, pairs.weights), 0.0, "assignment")]
+    try:
+        T = weighted_procrustes(source, target, pairs.weights)
+    except ValueError:  # too few or all on a line: other hypotheses may answer all the same
+        return []
+    return [Hypothesis(T, 0.0, "assignment")]
 
 
 def _weighted_candidates(problem: Problem) -> Correspondences:

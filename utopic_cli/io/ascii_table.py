@@ -8,7 +8,7 @@ from itertools import chain
 
 import numpy as np
 
-from utopic_cli.io.records import FormatError
+from utopic_cli.io.records import FormatError, Motion
 
 # Lines parsed at a time, which bounds the memory taken by token objects.
 _CHUNK = 1 << 16
@@ -91,6 +91,34 @@ def replace_columns(
         end = b"\r" if line.endswith(b"\r") and not tokens[-1].endswith(b"\r") else b""
         written.append(glue.join(tokens) + end)
     return written
+
+
+def move_lines(
+    lines: list[bytes],
+    places: Sequence[int],
+    positions: Sequence[Sequence[int]],
+    motion: Motion,
+    dtypes: Sequence[np.dtype],
+    delimiter: bytes | None = None,
+) -> None:
+    """Write moved coordinates, and normals where there are six columns, into lines of text.
+
+    Args:
+        lines: all lines; those at ``places`` are replaced.
+        places: which line each record is.
+        positions: per record, which tokens are x, y, z and the normal.
+        motion: the moved records.
+        dtypes: type of each of these columns.
+        delimiter: see `replace_columns`.
+    """
+    new = [lines[i] for i in places]
+    where = [row[:3] for row in positions]
+    new = replace_columns(new, where, motion.rows.tolist(), texts_of(motion.points, dtypes[:3]), delimiter)
+    if motion.normals is not None and motion.normal_rows is not None:
+        where, rows = [row[3:] for row in positions], motion.normal_rows.tolist()
+        new = replace_columns(new, where, rows, texts_of(motion.normals, dtypes[3:]), delimiter)
+    for i, line in zip(places, new):
+        lines[i] = line
 
 
 def texts_of(values: np.ndarray, dtypes: Sequence[np.dtype]) -> Iterable[list[bytes]]:

@@ -1,4 +1,4 @@
-"""One colour map for every picture: blue is little, red is much."""
+"""The colours of every picture: blue is little, red is much; source is orange, target blue."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 _STOPS = np.array(
     [(35, 60, 190), (60, 125, 210), (70, 185, 205), (245, 220, 90), (245, 125, 45), (225, 10, 20)], np.float64
 )
+SOURCE_COLOUR = (230, 159, 0)  # told apart from the target's by colour-blind eyes too
+TARGET_COLOUR = (0, 114, 178)
 _UNKNOWN = (128, 128, 128)
 
 

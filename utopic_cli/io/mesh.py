@@ -17,7 +17,8 @@ import numpy as np
 from utopic_cli.io.records import FormatError, Motion, Records
 
 SAMPLES = 30_000
-_COUNTS = re.compile(rb"\s*OFF\b[^\n]*?(?:\s+#[^\n]*)*\s+(\d{1,18})\s+(\d{1,18})")
+_COMMENT = re.compile(rb"#[^\n]*")
+_COUNTS = re.compile(rb"\s*OFF\s+(\d{1,18})\s+(\d{1,18})")
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ def _check_promises(data: bytes, kind: str) -> None:
                 " the file is damaged or cut short, copy it again"
             )
     elif kind == "off":
-        counts = _COUNTS.match(data)
+        counts = _COUNTS.match(_COMMENT.sub(b"", data))
         if counts is None:
             raise FormatError("does not start like an OFF file; check what it is, or export it again")
         vertices, faces = int(counts[1]), int(counts[2])

@@ -6,7 +6,7 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from utopic_cli.errors import OutputError
@@ -62,24 +62,54 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, *, overwrite: bo
     Raises:
         OutputError: the file exists (without ``overwrite``) or can't be written.
     """
-    path = Path(path)
-    target = _check_target(path, overwrite)
-    temporary = _temporary(target)
+    write_together({Path(path): data}, overwrite=overwrite)
+
+
+def write_together(contents: Mapping[Path, bytes], *, overwrite: bool) -> tuple[Path, ...]:
+    """Write several files, all or none: no file takes its place before every one is on the disk.
+
+    Args:
+        contents: bytes by path; the files take their places in this order.
+        overwrite: whether existing files may be replaced.
+
+    Returns:
+        The files that did not exist before, links followed.
+
+    Raises:
+        OutputError: a file exists (without ``overwrite``) or can't be written; then none of
+            those that did not exist before is left.
+    """
+    temporaries: dict[Path, Path] = {}
+    new: list[Path] = []
+    path = Path()
     try:
-        with open(_create(temporary), "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        if overwrite:
-            if target.exists():
+        for path, data in contents.items():
+            temporaries[path] = _temporary(_check_target(path, overwrite))
+            with open(_create(temporaries[path]), "wb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+        for path, temporary in temporaries.items():
+            target = _check_target(path, overwrite)
+            existed = target.exists()
+            if existed:
                 os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
-            os.replace(temporary, target)
-        else:
-            _rename_to_new(temporary, target)
-    except OSError as error:
-        raise _explained(path, error) from None
+            if overwrite:
+                os.replace(temporary, target)
+            else:
+                _rename_to_new(temporary, target)
+            if not existed:
+                new.append(target)
+    except BaseException as error:
+        for target in new:
+            target.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise _explained(path, error) from None
+        raise
     finally:
-        temporary.unlink(missing_ok=True)
+        for temporary in temporaries.values():
+            temporary.unlink(missing_ok=True)
+    return tuple(new)
 
 
 def _check_target(path: Path, overwrite: bool) -> Path:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
 from utopic_cli.io import lzf
-from utopic_cli.io.ascii_table import parse_table, replace_columns, texts_of
+from utopic_cli.io.ascii_table import move_lines, parse_table
 from utopic_cli.io.columns import Column, widen, write_columns
 from utopic_cli.io.records import FormatError, Motion, Records
 
@@ -275,15 +274,8 @@ class _AsciiPcd:
         declared = [self.header.dtypes[i] for i in self.wanted]
         wide = motion.widened(declared, as_text=True)
         dtypes = [np.dtype("f8") if grows else dtype for dtype, grows in zip(declared, wide)]
-        lines, span = _ascii_lines(self.data, self.header)
-        new = [lines[i] for i in span]
-        texts = texts_of(motion.points, dtypes[:3])
-        new = replace_columns(new, repeat(self.positions[:3]), motion.rows.tolist(), texts)
-        if motion.normals is not None and motion.normal_rows is not None:
-            texts = texts_of(motion.normals, dtypes[3:])
-            new = replace_columns(new, repeat(self.positions[3:]), motion.normal_rows.tolist(), texts)
-        for i, line in zip(span, new):
-            lines[i] = line
+        lines, places = _ascii_lines(self.data, self.header)
+        move_lines(lines, places, [self.positions] * len(places), motion, dtypes)
         head = self.header.rewritten(motion, [i for i, grows in zip(self.wanted, wide) if grows])
         return head + b"\n".join(lines)
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from utopic_cli.io.ascii_table import parse_table, replace_columns, texts_of
+from utopic_cli.io.ascii_table import move_lines, parse_table
 from utopic_cli.io.columns import Column, widen, write_columns
 from utopic_cli.io.ply_header import Element, PlyHeader, Property, parse_header
 from utopic_cli.io.records import FormatError, Motion, Records
@@ -189,16 +189,9 @@ class _AsciiPly:
         wide = motion.widened([p.dtype for p in properties], as_text=True)
         dtypes = [np.dtype("f8") if grows else p.dtype for p, grows in zip(properties, wide)]
         lines, spans = _ascii_lines(self.data, self.header)
-        span = spans["vertex"]
-        new = [lines[i] for i in span]
-        positions = _token_positions(new, self.vertex, list(self.wanted))
-        texts = texts_of(motion.points, dtypes[:3])
-        new = replace_columns(new, [row[:3] for row in positions], motion.rows.tolist(), texts)
-        if motion.normals is not None and motion.normal_rows is not None:
-            texts = texts_of(motion.normals, dtypes[3:])
-            new = replace_columns(new, [row[3:] for row in positions], motion.normal_rows.tolist(), texts)
-        for i, line in zip(span, new):
-            lines[i] = line
+        places = spans["vertex"]
+        positions = _token_positions([lines[i] for i in places], self.vertex, list(self.wanted))
+        move_lines(lines, places, positions, motion, dtypes)
         doubles = [p for p, grows in zip(properties, wide) if grows]
         return self.header.with_doubles(doubles) + _line_end(self.header).join(lines)
 

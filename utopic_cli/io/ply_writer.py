@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-_SOURCE_COLOUR = (230, 120, 30)
-_TARGET_COLOUR = (40, 110, 190)
+from utopic_cli.io.colour import SOURCE_COLOUR, TARGET_COLOUR
 
 
 def scalar_cloud_ply(
@@ -69,6 +68,6 @@ def merged_cloud_ply(
     """
     counts = [len(source_points), len(target_points)]
     points = np.concatenate([source_points, target_points])
-    colours = np.repeat(np.array([_SOURCE_COLOUR, _TARGET_COLOUR], np.uint8), counts, axis=0)
+    colours = np.repeat(np.array([SOURCE_COLOUR, TARGET_COLOUR], np.uint8), counts, axis=0)
     scan = np.repeat(np.array([0, 1], np.float32), counts)
     return scalar_cloud_ply(points, colours, {"scan": scan}, comments)

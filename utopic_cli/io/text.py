@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
-from utopic_cli.io.ascii_table import is_number, parse_table, replace_columns, texts_of
+from utopic_cli.io.ascii_table import is_number, move_lines, parse_table
 from utopic_cli.io.records import FormatError, Motion, Records
 
 _BOM = b"\xef\xbb\xbf"
@@ -30,16 +29,9 @@ class _Text:
     delimiter: bytes | None
 
     def rewrite(self, motion: Motion) -> bytes:
-        new = [self.lines[i] for i in self.rows]
-        texts = texts_of(motion.points, [_DOUBLE] * 3)
-        new = replace_columns(new, repeat(self.columns[:3]), motion.rows.tolist(), texts, self.delimiter)
-        if motion.normals is not None and motion.normal_rows is not None:
-            texts = texts_of(motion.normals, [_DOUBLE] * 3)
-            touched = motion.normal_rows.tolist()
-            new = replace_columns(new, repeat(self.columns[3:]), touched, texts, self.delimiter)
         lines = list(self.lines)
-        for i, line in zip(self.rows, new):
-            lines[i] = line
+        positions = [self.columns] * len(self.rows)
+        move_lines(lines, self.rows, positions, motion, [_DOUBLE] * 6, self.delimiter)
         return self.end.join(lines)
 
 
