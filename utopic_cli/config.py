@@ -69,6 +69,31 @@ class ModelConfig:
     hypothesis: bool = True
     normalisation: str = "layer"
 
+    def __post_init__(self) -> None:
+        """Refuse what no network can be built from.
+
+        Raises:
+            InputError: an unknown scheme (the known ones are listed) or a size that doesn't fit.
+        """
+        for name, known in (
+            ("input_features", INPUT_FEATURES),
+            ("positional_scheme", POSITIONAL_SCHEMES),
+            ("uncertainty_scheme", UNCERTAINTY_SCHEMES),
+            ("normalisation", NORMALISATIONS),
+        ):
+            if getattr(self, name) not in known:
+                raise InputError(f"{name} is {getattr(self, name)!r}; choose {', '.join(known)}")
+        sizes = ("patch_width", "adaptive_hidden", "feature_width", "descriptor_width", "heads", "layers")
+        for name in (*sizes, "uncertainty_samples", "sinkhorn_iterations"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if not 2 <= self.neighbours <= 20:
+            raise InputError(f"neighbours is {self.neighbours}; choose 2 to 20")
+        if self.transformer_width % self.heads:
+            raise InputError(
+                f"transformer_width {self.transformer_width} is no multiple of heads {self.heads}"
+            )
+
 
 @dataclass(frozen=True)
 class AlignOptions:

@@ -19,7 +19,9 @@ from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.solver import Estimate, Problem, solve
 from utopic_cli.estimation.surface import point_spacing
 from utopic_cli.estimation.verification import measure_fit
-from utopic_cli.io.scan import read_scan
+from utopic_cli.geometry import rigid
+from utopic_cli.io.records import FormatError
+from utopic_cli.io.scan import check_points, read_scan
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import choose_device, load_weights
 from utopic_cli.point_cloud import PointCloud
@@ -30,6 +32,9 @@ Progress = Callable[[str], None]
 
 UNIT_MISMATCH = 8.0
 """Extents that differ by more than this factor are named as a likely mix-up of units."""
+
+FEWEST_NODES = 50
+"""The network sees at least this many points of a scan that has them."""
 
 CLEAR_SCORE = 0.15
 """An estimate that scores less may rest on normals whose sides were guessed differently."""
@@ -89,7 +94,7 @@ def align(
     except TypeError as error:
         known = ", ".join(AlignOptions.__dataclass_fields__)
         raise UsageError(f"{error}; known options: {known}") from error
-    clouds = [_as_cloud(scan, name) for scan, name in ((source, "source"), (target, "target"))]
+    clouds = [_as_cloud(scan, name, settings.seed) for scan, name in ((source, "source"), (target, "target"))]
     return register(clouds[0], clouds[1], settings, initial=initial)
 
 
@@ -117,10 +122,7 @@ def register(
         InputError: the weights can't be used, or no transformation follows from the scans.
         UsageError: an unknown solver.
     """
-    if options.solver not in SOLVERS:
-        raise UsageError(f"{options.solver}: no such solver; choose {', '.join(SOLVERS)}")
-    if options.points < 50:
-        raise UsageError(f"{options.points} points are too few for the network; give at least 50")
+    _check_options(options, initial)
     if options.threads:
         torch.set_num_threads(options.threads)
     clock = _Clock(progress)
@@ -170,7 +172,12 @@ def register(
         warnings=_warnings(source, target, len(rivals)),
         weights_name=str(card["name"]),
         weights_sha256=str(card["sha256"]),
-        options=asdict(options),
+        options={
+            **asdict(options),
+            # What "auto" and 0 came to: both can change the last bits.
+            "device": str(next(model.parameters()).device),
+            "threads": torch.get_num_threads(),
+        },
     )
 
 
@@ -235,6 +242,17 @@ def _solve(prepared: PreparedPair, view: NetworkView, solver: str, initial: np.n
         raise InputError(f"no transformation can be found between these scans: {error}") from error
 
 
+def _check_options(options: AlignOptions, initial: np.ndarray | None) -> None:
+    if options.solver not in SOLVERS:
+        raise UsageError(f"{options.solver}: no such solver; choose {', '.join(SOLVERS)}")
+    for name, least in (("points", FEWEST_NODES), ("seed", 0), ("threads", 0)):
+        value = getattr(options, name)
+        if not isinstance(value, int) or value < least:
+            raise UsageError(f"{name} is {value!r}; give a whole number of at least {least}")
+    if initial is not None and (np.shape(initial) != (4, 4) or not rigid.is_rigid(initial, 1e-6)):
+        raise InputError("the initial transformation is no (4, 4) rigid motion")
+
+
 def _sides_in_doubt(prepared: PreparedPair, estimate: Estimate) -> bool:
     """Tell whether the two scans may have been given normals on opposite sides."""
     sheet = min(prepared.source.outwardness, prepared.target.outwardness) < CLEAR_OUTWARDNESS
@@ -262,21 +280,22 @@ def _better_side(
     return prepared, view, estimate
 
 
-def _as_cloud(scan: str | PathLike[str] | np.ndarray, name: str) -> PointCloud:
-    """Read a file, or check an array: (N, 3), at least 50 finite points after dropping NaN."""
-    if not isinstance(scan, np.ndarray):
-        return read_scan(scan).cloud
-    points = np.asarray(scan, dtype=np.float64)
+def _as_cloud(scan: str | PathLike[str] | np.ndarray, name: str, seed: int) -> PointCloud:
+    """Read a file, or check an array (N, 3) as a file's points are; NaN points are dropped."""
+    if isinstance(scan, (str, PathLike)):
+        return read_scan(scan, seed=seed).cloud
+    try:
+        points = np.asarray(scan, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: neither a path nor an array of numbers ({error})") from error
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name}: an array of shape {points.shape}; expected (N, 3)")
-    points = points[np.isfinite(points).all(axis=1)]
-    distinct = np.unique(points, axis=0)
-    if len(distinct) < 50:
-        raise InputError(f"{name}: {len(distinct)} distinct finite points; at least 50 are needed")
-    extents = np.linalg.svd(distinct - distinct.mean(axis=0), compute_uv=False)
-    if extents[1] < 1e-9 * extents[0]:
-        raise InputError(f"{name}: all points lie on one line; nothing can be aligned")
-    return PointCloud(points)
+    finite = points[np.isfinite(points).all(axis=1)]
+    try:
+        check_points(finite, len(points))
+    except FormatError as error:
+        raise InputError(f"{name}: {error}") from error
+    return PointCloud(finite)
 
 
 def _in_original_points(nodes: Correspondences, prepared: PreparedPair) -> Correspondences:

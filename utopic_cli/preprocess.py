@@ -282,8 +282,8 @@ def _patch(
     nodes: np.ndarray, cloud: np.ndarray, normals: np.ndarray, radius: float, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Take every second of the 2 * size nearest points within the radius: even cover, half the cost."""
-    k = min(2 * size, len(cloud))
-    distance, index = cKDTree(cloud).query(nodes, k=k, distance_upper_bound=radius)
+    nearest = range(1, min(2 * size, len(cloud)) + 1)  # a range: the answer has a column even for one
+    distance, index = cKDTree(cloud).query(nodes, k=nearest, distance_upper_bound=radius)
     distance, index = distance[:, ::2], index[:, ::2]
     mask = np.isfinite(distance)
     index = np.where(mask, index, 0)

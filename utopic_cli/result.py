@@ -61,8 +61,9 @@ class RegistrationResult:
         trusted: whether to rely on it, or None where there is no calibrated confidence.
         reasons: why (or why not), in plain words.
         ambiguous_with: rival (4, 4) transformations that fit nearly as well.
-        source_overlap: (N,) float32 in [0, 1], one per original source point.
-        target_overlap: (M,) float32 in [0, 1], one per original target point.
+        source_overlap: (N,) float32 in [0, 1], one per source point. Of a file or array with
+            NaN points these are the finite ones, in order.
+        target_overlap: (M,) float32 in [0, 1], one per target point.
         source_uncertainty: (N,) float32 in [0, 1], min-max normalised over the pair.
         target_uncertainty: (M,) float32 in [0, 1], min-max normalised over the pair.
         raw_uncertainty: un-normalised sample variance of the overlap per network point,

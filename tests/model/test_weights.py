@@ -76,3 +76,19 @@ def test_devices_are_checked():
     assert choose_device("cpu").type == "cpu"
     with pytest.raises(InputError, match="no such device"):
         choose_device("tpu")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positional_scheme": "geometrc"}, "choose vanilla, absolute, learned, geometric"),
+        ({"normalisation": "bach"}, "choose layer, batch"),
+        ({"heads": 3}, "transformer_width 16 is no multiple of heads 3"),
+        ({"neighbours": 40}, "choose 2 to 20"),
+        ({"layers": 0}, "layers is 0; it must be at least 1"),
+    ],
+    ids=str,
+)
+def test_an_architecture_that_cannot_be_built_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        ModelConfig(**{**SMALL, **change})

@@ -68,6 +68,15 @@ def test_mutual_nearest_needs_both_sides_and_the_radius():
     assert mutual_nearest(source, target, 0.5).tolist() == [[[1, 0], [0, 0], [0, 1]]]
 
 
+def test_the_papers_labels_are_hard_and_within_their_radius():
+    source = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [5.0, 0, 0]]])
+    target = torch.tensor([[[0.02, 0, 0], [5.2, 0, 0]]])
+    labels = label_pair(source, target, torch.eye(4)[None], torch.tensor([0.2]), hard_radius=0.075)
+    assert labels.correspondences.tolist() == [[[1, 0], [0, 0], [0, 0]]]
+    assert labels.source_overlap.tolist() == [[1, 0, 0]]
+    assert labels.target_overlap.tolist() == [[1, 0]]
+
+
 def test_descriptor_loss_is_the_cross_entropy_of_known_partners():
     similarity = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [0.3, 0.3]]])
     labels = hard_labels(torch.tensor([[[1.0, 0], [0, 1.0], [0, 0]]]))

@@ -97,7 +97,7 @@ def read_scan(path: str | os.PathLike[str], *, seed: int = 0) -> Scan:
             records = _READERS[kind](data)
         kept = np.flatnonzero(records.finite)
         points = records.points if len(kept) == len(records.points) else records.points[kept]
-        _check_points(points, len(records.points))
+        check_points(points, len(records.points))
     except FormatError as error:
         raise InputError(f"{path}: {_printable(str(error))}") from None
     except MemoryError:
@@ -130,8 +130,16 @@ def _check_magic(data: bytes, kind: str) -> None:
         raise FormatError(f"is a {content.upper()} file by its content; rename it to end in .{content}")
 
 
-def _check_points(points: np.ndarray, records: int) -> None:
-    """Refuse points that fix no transformation."""
+def check_points(points: np.ndarray, records: int) -> None:
+    """Refuse points that fix no transformation.
+
+    Args:
+        points: (N, 3) finite float64.
+        records: how many points there were before those that are not finite were dropped.
+
+    Raises:
+        FormatError: too few distinct points, all on a line, or coordinates beyond all reason.
+    """
     if len(points) == 0:
         raise FormatError(f"none of its {records} points is finite; export it again")
     if np.abs(points).max() > _LARGEST_COORDINATE:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from utopic_cli.errors import InputError, OutputError
+from utopic_cli.errors import InputError
+from utopic_cli.io.output import write_atomically
 
 
 def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
@@ -20,16 +20,7 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(buffer.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: the checkpoint can't be written ({error.strerror})") from error
+    write_atomically(path, buffer.getvalue(), overwrite=True)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

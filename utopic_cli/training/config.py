@@ -68,7 +68,12 @@ class Schedule:
 
 @dataclass(frozen=True)
 class LossSettings:
-    """Weights of the loss terms."""
+    """Weights of the loss terms, and what counts as a correspondence.
+
+    ``correspondence_radius`` 0 gives soft correspondences for scans that share no points; a
+    positive one gives the paper's mutual nearest neighbours within that radius (the larger
+    cloud has radius 1).
+    """
 
     descriptor: float = 0.5
     registration: float = 1.0
@@ -76,10 +81,11 @@ class LossSettings:
     overlap: float = 1.0
     uncertainty: float = 1.0
     completion: float = 0.1
+    correspondence_radius: float = 0.0
 
     def weights(self) -> LossWeights:
         """Return the weights by term."""
-        return LossWeights(**to_dict(self))
+        return LossWeights(**{name: getattr(self, name) for name in LossWeights._fields})
 
 
 @dataclass(frozen=True)

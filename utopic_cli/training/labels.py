@@ -35,7 +35,11 @@ class Labels(NamedTuple):
 
 
 def label_pair(
-    source_points: Tensor, target_points: Tensor, gt_T_target_source: Tensor, spacing: Tensor
+    source_points: Tensor,
+    target_points: Tensor,
+    gt_T_target_source: Tensor,
+    spacing: Tensor,
+    hard_radius: float = 0.0,
 ) -> Labels:
     """Label a batch of sampled pairs.
 
@@ -48,11 +52,21 @@ def label_pair(
         target_points: (B, M, 3).
         gt_T_target_source: (B, 4, 4).
         spacing: (B,) node spacing.
+        hard_radius: if positive, the correspondences are the paper's mutual nearest neighbours
+            within this radius instead.
     """
     moved = source_points @ gt_T_target_source[:, :3, :3].transpose(1, 2) + gt_T_target_source[:, None, :3, 3]
     distance = torch.cdist(moved, target_points, compute_mode="donot_use_mm_for_euclid_dist")
     distance = distance / spacing.view(-1, 1, 1)
     near = distance < POSITIVE_REACH
+    if hard_radius > 0:
+        near = distance * spacing.view(-1, 1, 1) < hard_radius
+        return Labels(
+            mutual_nearest(moved, target_points, hard_radius),
+            torch.zeros_like(near),
+            near.any(dim=2).float(),
+            near.any(dim=1).float(),
+        )
     weight = torch.exp(-0.5 * (distance / SOFTNESS) ** 2) * near
     forward = _nearest_four(weight)
     backward = _nearest_four(weight.transpose(1, 2)).transpose(1, 2)

@@ -54,9 +54,10 @@ class LossWeights(NamedTuple):
 class TrainingNetwork(nn.Module):
     """Wraps ``Utopic`` with the descriptor temperature, the completion decoder and the losses."""
 
-    def __init__(self, config: ModelConfig) -> None:
-        """Build with random weights."""
+    def __init__(self, config: ModelConfig, correspondence_radius: float = 0.0) -> None:
+        """Build with random weights; see ``LossSettings`` for the radius."""
         super().__init__()
+        self.correspondence_radius = correspondence_radius
         self.inference = Utopic(config)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(13.0)))
         self.completion = CompletionDecoder(config.feature_width)
@@ -65,7 +66,13 @@ class TrainingNetwork(nn.Module):
     def label(self, pair: TrainingPair) -> Labels:
         """Label a batch of pairs."""
         source, target = pair.source, pair.target
-        return label_pair(source.points, target.points, pair.gt_T_target_source, source.spacing)
+        return label_pair(
+            source.points,
+            target.points,
+            pair.gt_T_target_source,
+            source.spacing,
+            self.correspondence_radius,
+        )
 
     def descriptor_stage(self, pair: TrainingPair) -> dict[str, Tensor]:
         """First stage: the extractor alone, by its descriptors. Returns loss terms."""

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from utopic_cli.errors import InputError, UtopicError
+from utopic_cli.io.output import write_together
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import pack_weights
 from utopic_cli.synthesis.pairs import PairSettings, random_pair
@@ -83,9 +84,13 @@ def train(
     schedule = config.schedule
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(schedule.seed)  # initial weights only; every later draw has its own generator
-    network = TrainingNetwork(config.model).to(device)
+    network = TrainingNetwork(config.model, config.loss.correspondence_radius).to(device)
     if start_from is not None:
-        network.inference.load_state_dict(start_from)
+        try:
+            network.inference.load_state_dict(start_from)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"the weights to start from have another architecture: {reason}") from error
     optimiser = _optimiser(network, schedule)
     average = {name: value.detach().clone() for name, value in network.inference.state_dict().items()}
     done, elapsed = 0, 0.0
@@ -182,13 +187,10 @@ def train(
 
 
 def export(model: Utopic, card: dict[str, Any], out: Path) -> Path:
-    """Write weights and card to a folder; the card first, so that weights never lack theirs."""
+    """Write weights and card to a folder, both or neither."""
     blob, text = pack_weights(model, card)
     path = out / "utopic.safetensors"
-    for target, data in ((path.with_suffix(".json"), text), (path, blob)):
-        temporary = target.with_name(f".{target.name}.tmp")
-        temporary.write_bytes(data)
-        temporary.replace(target)
+    write_together({path.with_suffix(".json"): text, path: blob}, overwrite=True)
     return path
 
 
