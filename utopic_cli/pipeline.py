@@ -148,7 +148,7 @@ def register(
     clock.start("measure")
     correspondences = _in_original_points(estimate.correspondences, prepared)
     threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
-    fit = replace(measure_fit(source, target, transformation, threshold), inlier_ratio=estimate.support)
+    fit = measure_fit(source, target, transformation, threshold, estimate.support)
     rivals = [rival for rival in estimate.rivals if rival.score > RIVAL_SHARE * estimate.score]
     clock.start("carry to all points")
     source_all = _carry(source, prepared.source_centre, prepared.scale, prepared.source.points,

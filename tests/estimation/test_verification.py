@@ -95,24 +95,22 @@ def test_point_spacing_is_that_of_the_places() -> None:
 def test_measure_fit_counts_both_ways_in_the_points_own_units() -> None:
     whole, part = sheet(0.0), sheet(0.0, across=0.5)
     T = rigid.rigid(np.eye(3), np.array([0.0, 0.0, 0.004]))
-    fit = measure_fit(part, whole, T, threshold=0.03)
+    fit = measure_fit(part, whole, T, 0.03, inlier_ratio=0.4)
     assert fit.overlap_ratio["source"] == 1.0
     assert fit.overlap_ratio["target"] == pytest.approx(0.25, abs=0.04)
     assert fit.inlier_rmse == pytest.approx(0.004)
     assert fit.residual_percentiles == pytest.approx(dict.fromkeys(("p50", "p75", "p90", "p95"), 0.004))
-    assert fit.inlier_ratio == 1.0 and fit.threshold == 0.03
-    residuals = np.array([0.01, 0.02, 0.5, 0.9])
-    assert measure_fit(part, whole, T, 0.03, correspondence_residuals=residuals).inlier_ratio == 0.5
+    assert fit.inlier_ratio == 0.4 and fit.threshold == 0.03
 
 
 def test_measure_fit_of_scans_that_do_not_meet() -> None:
-    fit = measure_fit(sheet(0.0), sheet(9.0), np.eye(4), threshold=0.1)
+    fit = measure_fit(sheet(0.0), sheet(9.0), np.eye(4), 0.1, 0.0)
     assert fit.overlap_ratio == {"source": 0.0, "target": 0.0}
     assert np.isnan(fit.inlier_rmse) and np.isnan(fit.residual_percentiles["p50"])
 
 
 def test_measure_fit_refuses_nonsense() -> None:
     with pytest.raises(ValueError, match="threshold"):
-        measure_fit(sheet(0.0), sheet(0.0), np.eye(4), 0.0)
+        measure_fit(sheet(0.0), sheet(0.0), np.eye(4), 0.0, 0.0)
     with pytest.raises(ValueError, match="empty"):
-        measure_fit(PointCloud(np.zeros((0, 3))), sheet(0.0), np.eye(4), 0.1)
+        measure_fit(PointCloud(np.zeros((0, 3))), sheet(0.0), np.eye(4), 0.1, 0.0)

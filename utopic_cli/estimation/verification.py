@@ -89,8 +89,8 @@ def measure_fit(
     target: PointCloud,
     T: np.ndarray,
     threshold: float,
+    inlier_ratio: float,
     *,
-    correspondence_residuals: np.ndarray | None = None,
     limit: int = 200_000,
 ) -> FitMeasures:
     """Measure the fit at full resolution.
@@ -101,9 +101,8 @@ def measure_fit(
         T: (4, 4) T_target_source.
         threshold: largest distance at which a point has a counterpart (points' units);
             a few times the larger spacing of the two scans.
-        correspondence_residuals: (K,) distances of the network's correspondences under T,
-            from which ``inlier_ratio`` is computed; without them it is the share of source
-            points with a counterpart.
+        inlier_ratio: share of the correspondences that T explains, as the solver found it
+            (``Estimate.support``); passed on.
         limit: most points of each scan that are looked up; larger scans are thinned evenly.
 
     Returns:
@@ -123,10 +122,6 @@ def measure_fit(
     source_ratio, target_ratio = float(np.isfinite(forward).mean()), float(np.isfinite(backward).mean())
     names = ("p50", "p75", "p90", "p95")
     values = np.percentile(found, [50, 75, 90, 95]) if len(found) else np.full(4, np.nan)
-    if correspondence_residuals is not None and len(correspondence_residuals):
-        inlier_ratio = float((correspondence_residuals <= threshold).mean())
-    else:
-        inlier_ratio = source_ratio
     return FitMeasures(
         overlap_ratio={"source": source_ratio, "target": target_ratio},
         inlier_ratio=inlier_ratio,
