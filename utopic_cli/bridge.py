@@ -1,12 +1,99 @@
-"""Where NumPy becomes torch: sampled clouds as network input."""
+"""Where NumPy becomes torch and back: sampled clouds in, what the network says of them out."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
 
 from utopic_cli.model.cloud_input import CloudInput
-from utopic_cli.preprocess import SampledCloud
+from utopic_cli.model.utopic import Utopic
+from utopic_cli.model.weights import choose_device, load_weights
+from utopic_cli.preprocess import PreparedPair, SampledCloud
+
+
+@dataclass(frozen=True)
+class NetworkView:
+    """What the network says about the sampled points of one pair, as float64 arrays.
+
+    Attributes:
+        matching_scores: (N, M) soft correspondences without slack.
+        source_overlap: (N,), target_overlap: (M,) probabilities.
+        source_uncertainty: (N,), target_uncertainty: (M,) min-max normalised over the pair.
+        source_raw: (N,), target_raw: (M,) un-normalised.
+    """
+
+    matching_scores: np.ndarray
+    source_overlap: np.ndarray
+    target_overlap: np.ndarray
+    source_uncertainty: np.ndarray
+    target_uncertainty: np.ndarray
+    source_raw: np.ndarray
+    target_raw: np.ndarray
+
+
+@lru_cache(maxsize=2)
+def load_network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
+    """Load weights once a process: the network on its device, and its card.
+
+    Raises:
+        InputError: the weights or the device can't be used.
+    """
+    model, card = load_weights(weights)
+    return model.to(choose_device(device)), card
+
+
+@contextmanager
+def cpu_threads(count: int) -> Iterator[int]:
+    """Give torch ``count`` CPU threads for a while (0: as it is); yields how many there are."""
+    before = torch.get_num_threads()
+    if count:
+        torch.set_num_threads(count)
+    try:
+        yield torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+
+
+def predict(
+    model: Utopic, prepared: PreparedPair, seed: int, hypothesis: np.ndarray | None = None
+) -> NetworkView:
+    """Run the network on a prepared pair, on the device its weights are on.
+
+    Args:
+        model: the network.
+        prepared: the pair.
+        seed: seed of the overlap samples.
+        hypothesis: (4, 4) transformation between the normalised clouds to judge the points by.
+    """
+    device = next(model.parameters()).device
+    k = model.config.neighbours
+    with torch.inference_mode():
+        prediction = model(
+            to_cloud_input(prepared.source, prepared.spacing, k).to(device),
+            to_cloud_input(prepared.target, prepared.spacing, k).to(device),
+            generator=torch.Generator().manual_seed(seed),
+            hypothesis=None
+            if hypothesis is None
+            else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
+        )
+    source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
+    if not model.config.overlap:  # the variant without O weighs all correspondences alike
+        source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
+    return NetworkView(
+        _array(prediction.matching_scores[:, :-1, :-1]),
+        _array(source_overlap),
+        _array(target_overlap),
+        _array(prediction.source_uncertainty),
+        _array(prediction.target_uncertainty),
+        _array(prediction.source_distribution.raw_uncertainty),
+        _array(prediction.target_distribution.raw_uncertainty),
+    )
 
 
 def to_cloud_input(cloud: SampledCloud, spacing: float, neighbours: int) -> CloudInput:
@@ -32,3 +119,8 @@ def to_cloud_input(cloud: SampledCloud, spacing: float, neighbours: int) -> Clou
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))[None]
+
+
+def _array(batch: torch.Tensor) -> np.ndarray:
+    """Return the only item of a batch as float64."""
+    return batch[0].detach().cpu().numpy().astype(np.float64)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from dataclasses import asdict, replace
 from os import PathLike
 from typing import Any
 
 import numpy as np
-import torch
 
-from utopic_cli.bridge import to_cloud_input
+from utopic_cli.bridge import NetworkView, cpu_threads, load_network, predict
 from utopic_cli.config import SOLVERS, AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.refinement import refine
@@ -23,7 +21,6 @@ from utopic_cli.geometry import rigid
 from utopic_cli.io.records import FormatError
 from utopic_cli.io.scan import check_points, read_scan
 from utopic_cli.model.utopic import Utopic
-from utopic_cli.model.weights import choose_device, load_weights
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, carry_to_all, prepare
 from utopic_cli.result import Correspondences, RegistrationResult
@@ -47,26 +44,6 @@ RIVAL_SHARE = 0.85
 
 COUNTERPART_REACH = 3.0
 """A point has a counterpart within this many spacings of the sparser scan."""
-
-
-@dataclass(frozen=True)
-class NetworkView:
-    """What the network says about the sampled points of one pair, as float64 arrays.
-
-    Attributes:
-        matching_scores: (N, M) soft correspondences without slack.
-        source_overlap: (N,), target_overlap: (M,) probabilities.
-        source_uncertainty: (N,), target_uncertainty: (M,) min-max normalised over the pair.
-        source_raw: (N,), target_raw: (M,) un-normalised.
-    """
-
-    matching_scores: np.ndarray
-    source_overlap: np.ndarray
-    target_overlap: np.ndarray
-    source_uncertainty: np.ndarray
-    target_uncertainty: np.ndarray
-    source_raw: np.ndarray
-    target_raw: np.ndarray
 
 
 def align(
@@ -123,12 +100,20 @@ def register(
         UsageError: an unknown solver.
     """
     _check_options(options, initial)
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    clock = _Clock(progress)
+    with cpu_threads(options.threads) as threads:
+        return _register(source, target, replace(options, threads=threads), initial, _Clock(progress))
 
+
+def _register(
+    source: PointCloud,
+    target: PointCloud,
+    options: AlignOptions,
+    initial: np.ndarray | None,
+    clock: _Clock,
+) -> RegistrationResult:
+    """The verbs of a registration, in order."""
     clock.start("load weights")
-    model, card = _network(options.weights, options.device)
+    model, card = load_network(options.weights, options.device)
     clock.start("prepare")
     prepared = prepare(source, target, options.points)
     clock.start("predict")
@@ -151,10 +136,18 @@ def register(
     fit = measure_fit(source, target, transformation, threshold, estimate.support)
     rivals = [rival for rival in estimate.rivals if rival.score > RIVAL_SHARE * estimate.score]
     clock.start("carry to all points")
-    source_all = _carry(source, prepared.source_centre, prepared.scale, prepared.source.points,
-                        view.source_overlap, view.source_uncertainty)  # fmt: skip
-    target_all = _carry(target, prepared.target_centre, prepared.scale, prepared.target.points,
-                        view.target_overlap, view.target_uncertainty)  # fmt: skip
+    source_all = _carry(
+        (source.points - prepared.source_centre) / prepared.scale,
+        prepared.source.points,
+        view.source_overlap,
+        view.source_uncertainty,
+    )
+    target_all = _carry(
+        (target.points - prepared.target_centre) / prepared.scale,
+        prepared.target.points,
+        view.target_overlap,
+        view.target_uncertainty,
+    )
     return RegistrationResult(
         T_target_source=transformation,
         confidence=None,
@@ -172,55 +165,9 @@ def register(
         warnings=_warnings(source, target, len(rivals)),
         weights_name=str(card["name"]),
         weights_sha256=str(card["sha256"]),
-        options={
-            **asdict(options),
-            # What "auto" and 0 came to: both can change the last bits.
-            "device": str(next(model.parameters()).device),
-            "threads": torch.get_num_threads(),
-        },
+        # With what "auto" and 0 came to: device and thread count can change the last bits.
+        options={**asdict(options), "device": str(next(model.parameters()).device)},
     )
-
-
-def predict(
-    model: Utopic, prepared: PreparedPair, seed: int, hypothesis: np.ndarray | None = None
-) -> NetworkView:
-    """Run the network on a prepared pair, on the device its weights are on.
-
-    Args:
-        model: the network.
-        prepared: the pair.
-        seed: seed of the overlap samples.
-        hypothesis: (4, 4) transformation between the normalised clouds to judge the points by.
-    """
-    device = next(model.parameters()).device
-    k = model.config.neighbours
-    with torch.inference_mode():
-        prediction = model(
-            to_cloud_input(prepared.source, prepared.spacing, k).to(device),
-            to_cloud_input(prepared.target, prepared.spacing, k).to(device),
-            generator=torch.Generator().manual_seed(seed),
-            hypothesis=None
-            if hypothesis is None
-            else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
-        )
-    source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
-    if not model.config.overlap:  # the variant without O weighs all correspondences alike
-        source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
-    return NetworkView(
-        _array(prediction.matching_scores[:, :-1, :-1]),
-        _array(source_overlap),
-        _array(target_overlap),
-        _array(prediction.source_uncertainty),
-        _array(prediction.target_uncertainty),
-        _array(prediction.source_distribution.raw_uncertainty),
-        _array(prediction.target_distribution.raw_uncertainty),
-    )
-
-
-@lru_cache(maxsize=2)
-def _network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
-    model, card = load_weights(weights)
-    return model.to(choose_device(device)), card
 
 
 def _solve(prepared: PreparedPair, view: NetworkView, solver: str, initial: np.ndarray | None) -> Estimate:
@@ -306,17 +253,9 @@ def _in_original_points(nodes: Correspondences, prepared: PreparedPair) -> Corre
     )
 
 
-def _carry(
-    cloud: PointCloud,
-    centre: np.ndarray,
-    scale: float,
-    nodes: np.ndarray,
-    overlap: np.ndarray,
-    uncertainty: np.ndarray,
-) -> np.ndarray:
-    """Carry overlap and uncertainty from nodes to every original point -> (N, 2) float32 in [0, 1]."""
-    values = carry_to_all((cloud.points - centre) / scale, nodes, np.stack([overlap, uncertainty], axis=1))
-    return np.clip(values, 0.0, 1.0)
+def _carry(points: np.ndarray, nodes: np.ndarray, overlap: np.ndarray, uncertainty: np.ndarray) -> np.ndarray:
+    """Carry overlap and uncertainty from nodes to all normalised points -> (N, 2) float32 in [0, 1]."""
+    return np.clip(carry_to_all(points, nodes, np.stack([overlap, uncertainty], axis=1)), 0.0, 1.0)
 
 
 def _summary(view: NetworkView) -> dict[str, float]:
@@ -342,11 +281,6 @@ def _warnings(source: PointCloud, target: PointCloud, rivals: int) -> tuple[str,
             f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?"
         )
     return tuple(warnings)
-
-
-def _array(batch: torch.Tensor) -> np.ndarray:
-    """Return the only item of a batch as float64."""
-    return batch[0].detach().cpu().numpy().astype(np.float64)
 
 
 class _Clock:
