@@ -94,4 +94,6 @@ def test_constraints_pin_every_dependency():
 def test_usage_errors_exit_2_and_the_module_runs_like_the_command():
     result = run_python("-m", "utopic_cli", "align", "--no-such-option", env={**os.environ, "NO_COLOR": "1"})
     assert result.returncode == 2
-    assert "Usage: utopic align" in result.stderr
+    assert result.stderr.splitlines() == [
+        "utopic: error: No such option: --no-such-option; see 'utopic align --help'"
+    ]

@@ -22,10 +22,10 @@ from utopic_cli.commands.info import info
 from utopic_cli.commands.train import train
 from utopic_cli.errors import UtopicError
 
-# Usage errors are Typer's own to print. Their base class has moved between Typer's versions
-# (click, then a copy of it), so it is taken from a class that is exported by all of them.
+# The base class of usage errors has moved between Typer's versions (click, then a copy of it),
+# so it is taken from a class that is exported by all of them.
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
-_PASSED_ON = (typer.Exit, typer.Abort, _USAGE_ERROR)
+_PASSED_ON = (typer.Exit, typer.Abort)
 
 
 class Door(TyperGroup):
@@ -40,6 +40,11 @@ class Door(TyperGroup):
             return super().invoke(ctx)
         except _PASSED_ON:
             raise
+        except _USAGE_ERROR as error:
+            if type(error).__name__ == "NoArgsIsHelpError":  # "utopic bench" alone asks for help
+                raise
+            command = error.ctx.command_path if error.ctx else "utopic"
+            _leave(ctx, f"error: {_one_line(error.format_message()).rstrip('.')}; see '{command} --help'", 2)
         except KeyboardInterrupt:
             _leave(ctx, "interrupted", 130)
         except BrokenPipeError:
@@ -51,7 +56,7 @@ class Door(TyperGroup):
             _leave(ctx, f"error: unexpected {what}; this is a bug, run with --debug for the traceback", 1)
 
 
-def _one_line(error: BaseException) -> str:
+def _one_line(error: BaseException | str) -> str:
     return " ".join(str(error).splitlines())
 
 

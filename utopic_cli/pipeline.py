@@ -23,7 +23,7 @@ from utopic_cli.io.scan import check_points, read_scan
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, carry_to_all, prepare
-from utopic_cli.result import Correspondences, RegistrationResult
+from utopic_cli.result import Correspondences, FitMeasures, RegistrationResult
 
 Progress = Callable[[str], None]
 
@@ -41,6 +41,9 @@ CLEAR_OUTWARDNESS = 0.1
 
 RIVAL_SHARE = 0.85
 """A distinct pose with more than this share of the best one's score is named as a rival."""
+
+LITTLE_OVERLAP = 0.1
+"""Below this share of points with a counterpart, even a right answer can't be told from chance."""
 
 COUNTERPART_REACH = 3.0
 """A point has a counterpart within this many spacings of the sparser scan."""
@@ -152,7 +155,7 @@ def _register(
         T_target_source=transformation,
         confidence=None,
         trusted=None,
-        reasons=("these weights carry no calibration, so there is no verdict on this result",),
+        reasons=("these weights carry no calibration, so there is no verdict: look at the result",),
         ambiguous_with=tuple(prepared.denormalise(rival.T_target_source) for rival in rivals),
         source_overlap=source_all[:, 0],
         target_overlap=target_all[:, 0],
@@ -162,7 +165,7 @@ def _register(
         correspondences=correspondences,
         fit=fit,
         timings_s=clock.stop(),
-        warnings=_warnings(source, target, len(rivals)),
+        warnings=_warnings(source, target, fit, len(rivals)),
         weights_name=str(card["name"]),
         weights_sha256=str(card["sha256"]),
         # With what "auto" and 0 came to: device and thread count can change the last bits.
@@ -268,9 +271,12 @@ def _summary(view: NetworkView) -> dict[str, float]:
     }
 
 
-def _warnings(source: PointCloud, target: PointCloud, rivals: int) -> tuple[str, ...]:
+def _warnings(source: PointCloud, target: PointCloud, fit: FitMeasures, rivals: int) -> tuple[str, ...]:
     """Say what a user should know beyond the numbers."""
     warnings = []
+    name, share = min(fit.overlap_ratio.items(), key=lambda item: item[1])
+    if share < LITTLE_OVERLAP:
+        warnings.append(f"only {share:.0%} of the {name} finds a counterpart: the answer is likely wrong")
     if rivals:
         poses = "another pose fits" if rivals == 1 else f"{rivals} other poses fit"
         warnings.append(f"{poses} nearly as well (symmetry, or too little overlap): see ambiguous_with")

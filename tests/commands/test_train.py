@@ -27,7 +27,9 @@ def trainer(monkeypatch, library):
         return out / "utopic.safetensors"
 
     monkeypatch.setattr("utopic_cli.training.trainer.train", train)
-    monkeypatch.setattr("utopic_cli.synthesis.shapes.procedural_shapes", lambda rng, count: library)
+    monkeypatch.setattr(
+        "utopic_cli.synthesis.shapes.procedural_shapes", lambda rng, count, resolution: library
+    )
     return calls
 
 

@@ -263,7 +263,7 @@ def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> N
 
 def _verdict(result: RegistrationResult) -> str:
     if result.confidence is None:
-        return "aligned; no calibrated verdict in this version"
+        return "an answer was found, unverified"
     verdict = "aligned" if result.trusted else "aligned, but do not trust it"
     return f"{verdict}; confidence {result.confidence:.0%}"
 

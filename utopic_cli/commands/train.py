@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 RUN_FILES = ("checkpoint.pt", "utopic.safetensors", "utopic.json")
 PROCEDURAL = "procedural"
-PROCEDURAL_SHAPES = 240
+PROCEDURAL_SHAPES = 200
+PROCEDURAL_RESOLUTION = 32  # detail comes from the random warps
 PROCEDURAL_SEED = 20221015  # another stream than any training seed; the shapes are always the same
 
 
@@ -112,7 +113,8 @@ def load_library(data: str) -> ShapeLibrary:
     from utopic_cli.synthesis.shapes import load_shapes, procedural_shapes
 
     if data == PROCEDURAL:
-        return procedural_shapes(np.random.default_rng(PROCEDURAL_SEED), PROCEDURAL_SHAPES)
+        rng = np.random.default_rng(PROCEDURAL_SEED)
+        return procedural_shapes(rng, PROCEDURAL_SHAPES, PROCEDURAL_RESOLUTION)
     return load_shapes(data)
 
 

@@ -42,6 +42,8 @@ def find_weights(name_or_path: str) -> Path:
         if not path.is_file():
             raise InputError(f"{path}: no such weights file")
         return path
+    if path.is_file():
+        raise InputError(f"{path}: not a .safetensors file; weights are a .safetensors file with its card")
     bundled = bundled_weights()
     if name_or_path not in bundled:
         names = ", ".join(sorted(bundled)) or "none in this installation"

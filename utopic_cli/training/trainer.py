@@ -126,7 +126,8 @@ def train(
     weights = config.loss.weights()
     # On CPUs without matrix units bfloat16 costs half as much again, so only GPUs get it.
     reduced = schedule.bfloat16 and device.type == "cuda"
-    started = last_saved = last_validated = last_logged = time.monotonic()
+    started = last_validated = last_logged = time.monotonic()
+    last_saved = -math.inf  # the first checkpoint comes with the first record
     sums: dict[str, float] = {}
     since_log = 0
     measured: dict[str, float] = {}
