@@ -151,6 +151,8 @@ def load_open3d() -> Any:
             f"Open3D is installed but can't load ({error}); "
             f"install its system libraries: apt-get install {_OPEN3D_SYSTEM_LIBRARIES}"
         ) from error
+    # Its warnings about few correspondences would tear the progress line apart.
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
 
 

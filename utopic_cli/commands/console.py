@@ -118,7 +118,7 @@ class Console:
             nonlocal said
             if time.monotonic() - said >= SECONDS_BETWEEN_LINES:
                 said = time.monotonic()
-                self.line(f"  {step}")
+                self.line(f"  at work: {step}")
 
         return progress
 
