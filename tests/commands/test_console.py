@@ -12,7 +12,7 @@ from utopic_cli.commands import console
 from utopic_cli.commands.console import Console
 
 
-@pytest.mark.parametrize(("seconds", "said"), [(1e6, ""), (0.0, "  one\n  two\n")])
+@pytest.mark.parametrize(("seconds", "said"), [(1e6, ""), (0.0, "  at work: one\n  at work: two\n")])
 def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys, seconds, said):
     monkeypatch.setattr(console, "SECONDS_BETWEEN_LINES", seconds)
     with Console().progress() as progress:
