@@ -13,7 +13,7 @@ from tests.model.conftest import SMALL
 from utopic_cli.config import ModelConfig
 from utopic_cli.errors import InputError
 from utopic_cli.model.weights import load_weights
-from utopic_cli.synthesis.pairs import PairSettings, random_pair
+from utopic_cli.synthesis.pairs import PairSettings, random_pair, surface_pair
 from utopic_cli.synthesis.shapes import procedural_shapes
 from utopic_cli.training import trainer
 from utopic_cli.training.checkpoint import read_checkpoint
@@ -92,6 +92,22 @@ def test_one_pair_can_be_learnt_by_heart(shapes):
         optimiser.step()
         losses.append(float(loss.detach()))
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+
+
+def test_the_papers_setting_takes_a_step(shapes):
+    config = read_training_config("paper")
+    network = TrainingNetwork(config.model, config.loss.correspondence_radius, config.loss.completion_points)
+    rng = np.random.default_rng(0)
+    shared = surface_pair(shapes.mesh(0), rng, sampling="shared", keep=0.7, count=200, noise=0.01, clip=0.05)
+    pair = to_training_pair(sample_pair(shared, 200, rng), config.model.neighbours)
+    assert pair.source.points.shape[1] == 140
+    terms = network.joint_stage(pair, torch.Generator().manual_seed(0), masking=True, completion=True)
+    total_loss(terms, config.loss.weights()).backward()
+    # Parts the paper's loss does not reach: descriptors, their temperature, the skipped similarity.
+    unreached = [name for name, value in network.named_parameters() if value.grad is None]
+    assert all("descriptor" in name or "temperature" in name for name in unreached), unreached
+    sizes = {name: sum(p.numel() for p in part.parameters()) for name, part in network.named_children()}
+    assert 8e6 < sizes["inference"] < 10e6  # the paper's has 8.55 M
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_checkpoint(shapes, tmp_path, monkeypatch):

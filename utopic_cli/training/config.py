@@ -72,7 +72,8 @@ class LossSettings:
 
     ``correspondence_radius`` 0 gives soft correspondences for scans that share no points; a
     positive one gives the paper's mutual nearest neighbours within that radius (the larger
-    cloud has radius 1).
+    cloud has radius 1). ``completion_points`` is the size of the coarse completion; the fine
+    one has four times as many.
     """
 
     descriptor: float = 0.5
@@ -81,6 +82,7 @@ class LossSettings:
     overlap: float = 1.0
     uncertainty: float = 1.0
     completion: float = 0.1
+    completion_points: int = 128
     correspondence_radius: float = 0.0
 
     def weights(self) -> LossWeights:

@@ -54,13 +54,15 @@ class LossWeights(NamedTuple):
 class TrainingNetwork(nn.Module):
     """Wraps ``Utopic`` with the descriptor temperature, the completion decoder and the losses."""
 
-    def __init__(self, config: ModelConfig, correspondence_radius: float = 0.0) -> None:
-        """Build with random weights; see ``LossSettings`` for the radius."""
+    def __init__(
+        self, config: ModelConfig, correspondence_radius: float = 0.0, completion_points: int = 128
+    ) -> None:
+        """Build with random weights; see ``LossSettings`` for the radius and the points."""
         super().__init__()
         self.correspondence_radius = correspondence_radius
         self.inference = Utopic(config)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(13.0)))
-        self.completion = CompletionDecoder(config.feature_width)
+        self.completion = CompletionDecoder(config.feature_width, completion_points)
         self.in_canonical_frame = config.input_features == "invariant"
 
     def label(self, pair: TrainingPair) -> Labels:

@@ -84,7 +84,9 @@ def train(
     schedule = config.schedule
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(schedule.seed)  # initial weights only; every later draw has its own generator
-    network = TrainingNetwork(config.model, config.loss.correspondence_radius).to(device)
+    network = TrainingNetwork(
+        config.model, config.loss.correspondence_radius, config.loss.completion_points
+    ).to(device)
     if start_from is not None:
         try:
             network.inference.load_state_dict(start_from)
