@@ -175,6 +175,9 @@ def test_shipped_configurations_are_read(name):
         ("[optimizer]\nlr = 1", r"unknown section optimizer; known: model, loss, schedule"),
         ("[schedule]\nbatch = 'two'", r"batch is 'two'; expected int"),
         ("model = [", "not valid TOML"),
+        ("[schedule]\noptimiser = 'adam'", "optimiser is 'adam'; choose adamw, sgd"),
+        ("[schedule]\nbatch = 3", "descriptor_pairs is 8000; give a multiple of batch 3"),
+        ("[schedule]\npoints = [900, 400]", r"points is \[900, 400\]; give the fewest"),
     ],
 )
 def test_a_configuration_that_makes_no_sense_is_explained(tmp_path, text, message):

@@ -7,9 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-PATCH_SCALES = (1.8, 3.6, 7.2)
-"""Radius of each local-geometry patch, in node spacings."""
-
 
 class CloudInput(NamedTuple):
     """One cloud of each pair of a batch, in a unit common to both clouds of a pair.

@@ -65,6 +65,26 @@ class Schedule:
     validation_seconds: float = 600.0
     seed: int = 1
 
+    def __post_init__(self) -> None:
+        """Refuse a schedule that can't be run.
+
+        Raises:
+            InputError: an unknown optimiser, a size below 1, a range of points that is none, or
+                pairs that don't fill whole steps.
+        """
+        if self.optimiser not in OPTIMISERS:
+            raise InputError(f"optimiser is {self.optimiser!r}; choose {', '.join(OPTIMISERS)}")
+        for name in ("repeats", "batch"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("points", "last_points"):
+            limits = getattr(self, name)
+            if len(limits) != 2 or not 50 <= limits[0] <= limits[1]:
+                raise InputError(f"{name} is {list(limits)}; give the fewest (50 or more) and the most")
+        for name in ("descriptor_pairs", "joint_pairs"):
+            if getattr(self, name) < 0 or getattr(self, name) % self.batch:
+                raise InputError(f"{name} is {getattr(self, name)}; give a multiple of batch {self.batch}")
+
 
 @dataclass(frozen=True)
 class LossSettings:

@@ -184,7 +184,7 @@ def train(
         "wall_clock_s": round(elapsed + time.monotonic() - started, 1),
         "training": config.as_dict(),
         "data": {"shapes": len(training_shapes), "sets": sorted(set(training_shapes.sets.tolist()))},
-        "validation": measured,
+        "validation": measured or validate(_averaged(config, average), held_out, schedule.seed),
     }
     return export(_averaged(config, average), card, out)
 
