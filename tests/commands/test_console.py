@@ -29,7 +29,9 @@ def test_quiet_shows_no_progress(monkeypatch, capsys):
 
 
 WAITING = """
-import sys, time, utopic_cli.io.scan
+import signal, sys, time, utopic_cli.io.scan
+# As from a terminal: a job in the background of a script inherits Ctrl-C as ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from utopic_cli.cli import main
 def wait(*_, **__):
     print("reading", flush=True)
