@@ -8,7 +8,7 @@ import torch
 
 from tests.model.conftest import SMALL, bumpy_points, cloud_input
 from utopic_cli.config import ModelConfig
-from utopic_cli.model.cloud_input import CloudInput
+from utopic_cli.model.cloud_input import CloudInput, stack_clouds
 from utopic_cli.model.utopic import Utopic
 
 
@@ -83,30 +83,35 @@ def test_a_mirrored_shape_looks_different():
     assert difference.abs().max() > 1e-3
 
 
-def test_a_batch_of_two_gives_what_each_gives_alone():
-    model = build()
-    clouds = [cloud_input(bumpy_points(120, seed), model.config) for seed in range(4)]
-    stacked = [
-        CloudInput(
-            *(
-                tuple(torch.cat(parts) for parts in zip(first, second, strict=True))
-                if isinstance(first, tuple)
-                else torch.cat([first, second])
-                for first, second in zip(clouds[a], clouds[b], strict=True)
-            )
-        )
-        for a, b in ((0, 1), (2, 3))
+def test_a_filled_up_batch_gives_what_each_pair_gives_alone():
+    model = build(uncertainty_scheme="predicted")  # without random draws
+    torch.nn.init.normal_(model.hypothesis.weight, std=0.1)
+    pairs = [
+        tuple(cloud_input(bumpy_points(count, count), model.config) for count in counts)
+        for counts in ((120, 90), (70, 130))
     ]
+    source, target = (stack_clouds(clouds) for clouds in zip(*pairs, strict=True))
+    assert source.valid.sum(dim=1).tolist() == [120, 70] and target.valid.sum(dim=1).tolist() == [90, 130]
+    for cloud in (source, target):  # whatever stands in the filling rows
+        cloud.points[~cloud.valid], cloud.normals[~cloud.valid] = 0.1, 7.0
+        cloud.neighbours[~cloud.valid] = 3
+    gt = torch.eye(4).expand(2, 4, 4)
+    generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        both = model.first_matching(
-            model.extractor(stacked[0])[0],
-            model.extractor(stacked[1])[0],
-            torch.zeros(2, 120, 120),
-        )
-        alone = model.first_matching(
-            model.extractor(clouds[1])[0], model.extractor(clouds[3])[0], torch.zeros(1, 120, 120)
-        )
-    torch.testing.assert_close(both[1], alone[0], atol=1e-5, rtol=1e-4)
+        both = model(source, target, generator=generator, hypothesis=gt)
+        for number, (first, second) in enumerate(pairs):
+            alone = model(first, second, generator=generator, hypothesis=gt[:1])
+            n, m = first.points.shape[1], second.points.shape[1]
+            for name, count in (("source", n), ("target", m)):
+                for what in ("uncertainty", "overlap_logits"):
+                    filled = getattr(both, f"{name}_{what}")[number, :count]
+                    expected = getattr(alone, f"{name}_{what}")[0]
+                    torch.testing.assert_close(filled, expected, atol=1e-4, rtol=1e-4)
+            for what in ("coarse_scores", "matching_scores"):
+                filled, expected = getattr(both, what)[number], getattr(alone, what)[0]
+                torch.testing.assert_close(filled[:n, :m], expected[:n, :m], atol=1e-5, rtol=1e-4)
+                torch.testing.assert_close(filled[:n, -1], expected[:n, -1], atol=1e-5, rtol=1e-4)
+                torch.testing.assert_close(filled[-1, :m], expected[-1, :m], atol=1e-5, rtol=1e-4)
 
 
 def test_the_same_generator_gives_the_same_numbers_and_another_does_not():

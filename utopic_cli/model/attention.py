@@ -26,15 +26,29 @@ class AttentionLayer(nn.Module):
         self.attention_norm = nn.LayerNorm(width)
         self.output_norm = nn.LayerNorm(width)
 
-    def forward(self, queries: Tensor, context: Tensor, embedding: Tensor | None = None) -> Tensor:
-        """Attend from queries (B, N, d) to context (B, M, d), with embedding (B, 3, N, M) if any."""
+    def forward(
+        self,
+        queries: Tensor,
+        context: Tensor,
+        embedding: Tensor | None = None,
+        context_valid: Tensor | None = None,
+    ) -> Tensor:
+        """Attend from queries (B, N, d) to context (B, M, d).
+
+        Args:
+            queries: (B, N, d).
+            context: (B, M, d).
+            embedding: (B, 3, N, M), or None for plain attention.
+            context_valid: (B, M) bool, False where there is nothing to attend to; None: everywhere is.
+        """
         batch, count, width = queries.shape
         head_width = width // self.heads
         query = self.query(queries).view(batch, count, self.heads, head_width).transpose(1, 2)
         key_value = self.key_value(context).view(batch, -1, 2, self.heads, head_width)
         key, value = key_value.permute(2, 0, 3, 1, 4)  # each (B, heads, M, head_width)
         if self.relation is None or embedding is None:
-            message = nn.functional.scaled_dot_product_attention(query, key, value)
+            mask = None if context_valid is None else context_valid[:, None, None]
+            message = nn.functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         else:
             # (heads, 3) @ (3, N*M): no d_t-wide tensor per pair of points is ever made.
             bias = (self.relation.to(embedding.dtype) @ embedding.flatten(2)).view(
@@ -45,6 +59,9 @@ class AttentionLayer(nn.Module):
                 query.flatten(0, 1) / math.sqrt(head_width),
                 key.flatten(0, 1).transpose(1, 2),
             )
+            if context_valid is not None:
+                hidden = ~context_valid.repeat_interleave(self.heads, dim=0)[:, None]
+                scores = scores.masked_fill(hidden, -torch.inf)
             message = (torch.softmax(scores, dim=-1) @ value.flatten(0, 1)).view_as(query)
         message = message.transpose(1, 2).reshape(batch, count, width)
         features = self.attention_norm(queries + self.merge(message))
@@ -103,6 +120,8 @@ class GeometryTransformer(nn.Module):
         target_points: Tensor,
         source_embedding: Tensor | None,
         target_embedding: Tensor | None,
+        source_valid: Tensor | None = None,
+        target_valid: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return hybrid features of source (B, N, V) and target (B, M, V), in and out alike."""
         hidden_source, hidden_target = self.project_in(source), self.project_in(target)
@@ -110,11 +129,11 @@ class GeometryTransformer(nn.Module):
             hidden_source = hidden_source + self.position(source_points)
             hidden_target = hidden_target + self.position(target_points)
         for within, across in zip(self.self_attention, self.cross_attention, strict=True):
-            hidden_source = within(hidden_source, hidden_source, source_embedding)
-            hidden_target = within(hidden_target, hidden_target, target_embedding)
+            hidden_source = within(hidden_source, hidden_source, source_embedding, source_valid)
+            hidden_target = within(hidden_target, hidden_target, target_embedding, target_valid)
             hidden_source, hidden_target = (
-                across(hidden_source, hidden_target),
-                across(hidden_target, hidden_source),
+                across(hidden_source, hidden_target, context_valid=target_valid),
+                across(hidden_target, hidden_source, context_valid=source_valid),
             )
         # A residual around the whole block: the extractor's features are never lost.
         return source + self.project_out(hidden_source), target + self.project_out(hidden_target)

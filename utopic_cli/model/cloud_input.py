@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,8 @@ class CloudInput(NamedTuple):
         patches: for each of the three scales (B, N, K, 6) float32: offset of a neighbour in
             the dense scan over the patch radius, and that neighbour's normal.
         patch_masks: for each scale (B, N, K) bool, False where a patch has fewer than K points.
+        valid: (B, N) bool, False on the rows that fill a smaller cloud of a batch up, which come
+            last; None if there are none. No result depends on what those rows hold.
     """
 
     points: Tensor
@@ -27,6 +30,7 @@ class CloudInput(NamedTuple):
     neighbours: Tensor
     patches: tuple[Tensor, ...]
     patch_masks: tuple[Tensor, ...]
+    valid: Tensor | None = None
 
     def to(self, device: torch.device) -> CloudInput:
         """Return the same data on another device."""
@@ -37,7 +41,39 @@ class CloudInput(NamedTuple):
             self.neighbours.to(device),
             tuple(patch.to(device) for patch in self.patches),
             tuple(mask.to(device) for mask in self.patch_masks),
+            None if self.valid is None else self.valid.to(device),
         )
+
+
+def stack_clouds(clouds: Sequence[CloudInput]) -> CloudInput:
+    """Put batches of clouds of different sizes into one batch, the smaller ones filled up."""
+    most = max(cloud.points.shape[1] for cloud in clouds)
+
+    def stacked(parts: Sequence[Tensor]) -> Tensor:
+        return torch.cat([_filled(part, most) for part in parts])
+
+    valid = [
+        torch.ones(cloud.points.shape[:2], dtype=torch.bool) if cloud.valid is None else cloud.valid
+        for cloud in clouds
+    ]
+    padded = any(len(mask[0]) < most or not bool(mask.all()) for mask in valid)
+    return CloudInput(
+        stacked([cloud.points for cloud in clouds]),
+        stacked([cloud.normals for cloud in clouds]),
+        torch.cat([cloud.spacing for cloud in clouds]),
+        stacked([cloud.neighbours for cloud in clouds]),
+        tuple(stacked(scale) for scale in zip(*(cloud.patches for cloud in clouds))),
+        tuple(stacked(scale) for scale in zip(*(cloud.patch_masks for cloud in clouds))),
+        stacked(valid) if padded else None,
+    )
+
+
+def _filled(values: Tensor, most: int) -> Tensor:
+    """Fill (B, N, ...) up to ``most`` rows with zeros."""
+    missing = most - values.shape[1]
+    if not missing:
+        return values
+    return torch.cat([values, values.new_zeros(values.shape[0], missing, *values.shape[2:])], dim=1)
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:

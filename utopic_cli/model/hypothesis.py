@@ -38,13 +38,20 @@ def hypothesis_features(
     rotation = transformation[:, :3, :3].transpose(1, 2)
     moved = own.points @ rotation + transformation[:, None, :3, 3]
     distance = torch.cdist(moved, other.points, compute_mode="donot_use_mm_for_euclid_dist")
+    if other.valid is not None:
+        distance = distance.masked_fill(~other.valid[:, None], torch.inf)
     nearest = distance.min(dim=2)
     residual = nearest.values / own.spacing[:, None]  # (B, N)
     rows = torch.arange(len(moved), device=moved.device)[:, None]
     agreement = ((own.normals @ rotation) * other.normals[rows, nearest.indices]).sum(-1)
     near = [torch.exp(-0.5 * (residual / reach) ** 2) for reach in REACHES]
     local = torch.stack([*near, near[1] * agreement], dim=-1)  # (B, N, 4)
-    whole = local.mean(dim=1, keepdim=True).expand_as(local)
+    if own.valid is None:
+        mean = local.mean(dim=1, keepdim=True)
+    else:
+        share = own.valid / own.valid.sum(dim=1, keepdim=True)
+        mean = (local * share[..., None]).sum(dim=1, keepdim=True)
+    whole = mean.expand_as(local)
     flag = torch.ones_like(local[..., :1])
     return torch.cat([local, whole, flag], dim=-1) * present[:, None, None]
 

@@ -32,10 +32,14 @@ def sinkhorn(affinity: Tensor, iterations: int) -> Tensor:
     return torch.cat([scores, torch.cat([column_scale, corner], dim=1).transpose(1, 2)], dim=1)
 
 
-def _instance_norm(matrix: Tensor) -> Tensor:
-    """Zero mean and unit variance over each (N, M) map of a batch."""
-    centred = matrix - matrix.mean(dim=(1, 2), keepdim=True)
-    return centred * torch.rsqrt(centred.square().mean(dim=(1, 2), keepdim=True) + 1e-6)
+def _instance_norm(matrix: Tensor, real: Tensor | None) -> Tensor:
+    """Zero mean and unit variance over each (N, M) map of a batch, over its real entries if given."""
+    if real is None:
+        centred = matrix - matrix.mean(dim=(1, 2), keepdim=True)
+        return centred * torch.rsqrt(centred.square().mean(dim=(1, 2), keepdim=True) + 1e-6)
+    count = real.sum(dim=(1, 2), keepdim=True)
+    centred = (matrix - (matrix * real).sum(dim=(1, 2), keepdim=True) / count) * real
+    return centred * torch.rsqrt(centred.square().sum(dim=(1, 2), keepdim=True) / count + 1e-6)
 
 
 class AffinityMatching(nn.Module):
@@ -51,14 +55,26 @@ class AffinityMatching(nn.Module):
         self.bias = nn.Parameter(torch.tensor(-6.0))
         self.skip_gain = nn.Parameter(torch.tensor(2.5)) if descriptor_skip else None
 
-    def forward(self, source: Tensor, target: Tensor, similarity: Tensor) -> Tensor:
-        """Match features (B, N, V) and (B, M, V), with the descriptors' similarity (B, N, M).
+    def forward(
+        self, source: Tensor, target: Tensor, similarity: Tensor, real: Tensor | None = None
+    ) -> Tensor:
+        """Match features.
+
+        Args:
+            source: (B, N, V).
+            target: (B, M, V).
+            similarity: (B, N, M) of the descriptors.
+            real: (B, N, M) bool, False where a row or column only fills up a batch; None: all real.
 
         Returns:
             (B, N + 1, M + 1) soft correspondences with slack.
         """
         symmetric = 0.5 * (self.weight + self.weight.T)
-        affinity = self.gain * _instance_norm(((source @ symmetric) @ target.transpose(1, 2)).float())
+        affinity = ((source @ symmetric) @ target.transpose(1, 2)).float()
+        affinity = self.gain * _instance_norm(affinity, real)
         if self.skip_gain is not None:
-            affinity = affinity + self.skip_gain * _instance_norm(similarity.float())
-        return sinkhorn(affinity + self.bias, self.iterations)
+            affinity = affinity + self.skip_gain * _instance_norm(similarity.float(), real)
+        affinity = affinity + self.bias
+        if real is not None:
+            affinity = affinity.masked_fill(~real, -torch.inf)
+        return sinkhorn(affinity, self.iterations)

@@ -71,11 +71,22 @@ class UncertaintyQuantification(nn.Module):
         return OverlapDistribution(mean, log_variance, samples, raw)
 
 
-def normalise_uncertainty(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Min-max normalise raw uncertainties (B, N) and (B, M) over each pair; flat maps to 0."""
+def normalise_uncertainty(
+    source: Tensor, target: Tensor, valid: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Min-max normalise raw uncertainties over each pair; flat maps to 0.
+
+    Args:
+        source: (B, N).
+        target: (B, M).
+        valid: (B, N + M) bool, the points that count; None: all do.
+    """
     both = torch.cat([source, target], dim=1)
-    low = both.min(dim=1, keepdim=True).values
-    span = both.max(dim=1, keepdim=True).values - low
+    lowest, highest = both, both
+    if valid is not None:
+        lowest, highest = both.masked_fill(~valid, torch.inf), both.masked_fill(~valid, -torch.inf)
+    low = lowest.min(dim=1, keepdim=True).values
+    span = highest.max(dim=1, keepdim=True).values - low
     scale = torch.where(span > 1e-9, 1.0 / span.clamp_min(1e-9), torch.zeros_like(span))
     return (source - low) * scale, (target - low) * scale
 

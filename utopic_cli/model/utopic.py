@@ -116,7 +116,24 @@ class Utopic(nn.Module):
         if self.config.positional_scheme == "geometric":
             source_embedding = geometric_embedding(source.points, source.neighbours)
             target_embedding = geometric_embedding(target.points, target.neighbours)
-        where = (source.points, target.points, source_embedding, target_embedding)
+        where = (
+            source.points,
+            target.points,
+            source_embedding,
+            target_embedding,
+            source.valid,
+            target.valid,
+        )
+        valid = real = None
+        if source.valid is not None or target.valid is not None:
+            masks = [
+                torch.ones_like(cloud.points[..., 0], dtype=torch.bool)
+                if cloud.valid is None
+                else cloud.valid
+                for cloud in (source, target)
+            ]
+            valid = torch.cat(masks, dim=1)
+            real = masks[0][:, :, None] & masks[1][:, None]
 
         source_known, target_known = source_features, target_features
         source_evidence = target_evidence = None
@@ -128,11 +145,11 @@ class Utopic(nn.Module):
             source_known = source_features + self.hypothesis(source_evidence)
             target_known = target_features + self.hypothesis(target_evidence)
         source_hybrid, target_hybrid = self.first_transformer(source_known, target_known, *where)
-        coarse = self.first_matching(source_hybrid, target_hybrid, similarity)
+        coarse = self.first_matching(source_hybrid, target_hybrid, similarity, real)
         source_distribution = self.quantification(source_hybrid, generator, source_evidence)
         target_distribution = self.quantification(target_hybrid, generator, target_evidence)
         source_uncertainty, target_uncertainty = normalise_uncertainty(
-            source_distribution.raw_uncertainty, target_distribution.raw_uncertainty
+            source_distribution.raw_uncertainty, target_distribution.raw_uncertainty, valid
         )
 
         weighs = self.config.uncertainty_scheme != "none"
@@ -153,7 +170,7 @@ class Utopic(nn.Module):
         )
 
         source_final, target_final = self.second_transformer(source_aware, target_aware, *where)
-        matching = self.second_matching(source_final, target_final, similarity)
+        matching = self.second_matching(source_final, target_final, similarity, real)
         return Prediction(
             source_features=source_features,
             target_features=target_features,
