@@ -120,7 +120,7 @@ class AlignOptions:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a configuration dataclass as plain JSON-ready data."""
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(config).items()}
+    return {key: _listed(value) for key, value in asdict(config).items()}
 
 
 def from_dict(kind: type[ConfigType], values: dict[str, Any], where: str) -> ConfigType:
@@ -142,8 +142,8 @@ def from_dict(kind: type[ConfigType], values: dict[str, Any], where: str) -> Con
     built = {}
     for key, value in values.items():
         default = getattr(defaults, key)
-        if isinstance(default, tuple) and isinstance(value, list):
-            value = tuple(value)
+        if isinstance(default, tuple):
+            value = _tupled(value)
         if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not type(default):
@@ -152,3 +152,13 @@ def from_dict(kind: type[ConfigType], values: dict[str, Any], where: str) -> Con
             )
         built[key] = value
     return kind(**built)
+
+
+def _listed(value: Any) -> Any:
+    """Turn tuples, nested ones too, into lists, as JSON and TOML have them."""
+    return [_listed(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _tupled(value: Any) -> Any:
+    """Turn lists, nested ones too, into tuples."""
+    return tuple(_tupled(item) for item in value) if isinstance(value, list) else value

@@ -1,13 +1,28 @@
 from __future__ import annotations
 
+import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from utopic_cli.commands.train import describe, load_library
+from utopic_cli.commands.console import Console
+from utopic_cli.commands.training_view import TrainingView, clock, describe
 from utopic_cli.synthesis.shapes import procedural_shapes
 from utopic_cli.training.config import read_training_config
+
+RECORD = {
+    "pairs": 8,
+    "of": 100,
+    "stage": "joint",
+    "elapsed_s": 90.0,
+    "left_s": 3700.0,
+    "rate": 0.001,
+    "pairs_per_s": 3.2,
+    "waiting": 0.125,
+    "overlap": 0.5,
+}
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +38,15 @@ def trainer(monkeypatch, library):
         calls.append(
             {"config": config, "train": training_shapes, "val": validation_shapes, "out": out, **options}
         )
-        options["progress"]({"pairs": 8, "of": 100, "stage": "joint", "elapsed_s": 90.0, "loss": 0.5})
+        options["progress"](RECORD)
+        options["progress"]({**RECORD, "pairs": 10, "hit_rate": 0.25})
+        options["progress"]({**RECORD, "pairs": 12, "hit_rate": 0.375})
+        out.mkdir(exist_ok=True)
+        (out / "curves.html").write_text("")
         return out / "utopic.safetensors"
 
     monkeypatch.setattr("utopic_cli.training.trainer.train", train)
-    monkeypatch.setattr(
-        "utopic_cli.synthesis.shapes.procedural_shapes", lambda rng, count, resolution: library
-    )
+    monkeypatch.setattr("utopic_cli.synthesis.packing.open_shapes", lambda data, progress: library)
     return calls
 
 
@@ -41,8 +58,72 @@ def test_options_reach_the_trainer(cli, trainer, tmp_path):
     assert call["config"] == read_training_config("paper")
     assert (call["minutes"], call["resume"], call["out"], str(call["device"])) == (2.0, True, out, "cpu")
     assert len(call["train"]) == 9 and len(call["val"]) == 1
-    assert "8/100 pairs, joint, 1.5 min, loss 0.5" in result.stderr
-    assert str(out / "utopic.safetensors") in result.stderr
+
+
+def test_where_there_is_no_terminal_each_record_is_a_plain_line(cli, trainer, tmp_path):
+    out = tmp_path / "run"
+    result = cli("train", "--out", out)
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    common = "joint, 1:30, about 1:01:40 left, pairs/s 3.2, waiting for pairs 12.5 %"
+    assert f"8/100 pairs, {common}, overlap 0.5" in lines
+    assert f"10/100 pairs, {common}, overlap 0.5, hit rate 25.0 %" in lines
+    assert f"12/100 pairs, {common}, overlap 0.5, hit rate 37.5 % ▲12.5" in lines
+    assert lines[-3:] == [
+        "12 pairs seen; hit rate 37.5 % (at first 25.0 %)",
+        f"wrote {out}/utopic.safetensors; use it: utopic align SOURCE TARGET --weights "
+        f"{out}/utopic.safetensors",
+        f"curves: {out}/curves.html",
+    ]
+    assert "\x1b" not in result.stderr
+
+
+def test_quiet_says_nothing(cli, trainer, tmp_path):
+    assert cli("train", "--out", tmp_path / "run", "--quiet").stderr == ""
+
+
+def test_of_several_processes_one_speaks(cli, trainer, tmp_path, monkeypatch):
+    monkeypatch.setenv("RANK", "1")
+    assert cli("train", "--out", tmp_path / "run").stderr == ""
+    monkeypatch.setenv("RANK", "0")
+    assert cli("train", "--out", tmp_path / "run").stderr != ""
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def shown(monkeypatch, columns=100, **environment):
+    """Return what a terminal of that width gets when three records are shown."""
+    stream = Terminal()
+    monkeypatch.setattr("sys.stderr", stream)
+    for name, value in {"TERM": "xterm-256color", "COLUMNS": str(columns), **environment}.items():
+        monkeypatch.setenv(name, value)
+    with TrainingView(Console()) as view:
+        view.show({**RECORD, "hit_rate": 0.25})
+        view.show({**RECORD, "pairs": 10, "hit_rate": 0.125, "match_rate": 0.5})
+        view.show({**RECORD, "pairs": 50})
+    return stream.getvalue()
+
+
+def test_a_terminal_shows_the_last_record_and_the_last_validation(monkeypatch):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    text = shown(monkeypatch)
+    assert "\x1b[33m" in text and "▼12.5" in text  # worse than the one before
+    plain = shown(monkeypatch, NO_COLOR="1")
+    assert "\x1b[33m" not in plain and "▼12.5" in plain
+    for part in ("joint stage", "50/100 pairs", "1:30, about 1:01:40 left", "3.2 pairs/s"):
+        assert part in plain, part
+    assert "overlap\N{NO-BREAK SPACE}0.5" in plain and "match\N{NO-BREAK SPACE}rate" in plain
+
+
+@pytest.mark.parametrize("columns", [40, 60, 200])
+def test_the_view_fits_the_terminal(monkeypatch, columns):
+    import re
+
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown(monkeypatch, columns, NO_COLOR="1"))
+    assert max(len(line) for line in re.split(r"[\r\n]+", plain)) <= columns
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "utopic.safetensors", "utopic.json"])
@@ -64,14 +145,23 @@ def test_a_configuration_that_cant_be_used_exits_4(cli, trainer, tmp_path, conte
     assert "c.toml" in result.stderr
 
 
-def test_shapes_that_are_not_there_exit_4(cli, trainer, tmp_path):
-    assert cli("train", "--out", tmp_path / "run", "--data", tmp_path / "nothing").exit_code == 4
+@pytest.mark.parametrize("data", ["nothing", "empty", "modelnet40:nothing"])
+def test_shapes_that_are_not_there_exit_4(cli, tmp_path, monkeypatch, data):
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    result = cli("train", "--out", tmp_path / "run", "--data", data)
+    assert result.exit_code == 4, result.output
+    assert data.split(":")[-1] in result.stderr.splitlines()[-1]
+    assert not (tmp_path / "run").exists()
 
 
-def test_procedural_shapes_are_the_same_every_time(monkeypatch):
-    monkeypatch.setattr("utopic_cli.commands.train.PROCEDURAL_SHAPES", 3)
-    first, second = load_library("procedural"), load_library("procedural")
-    assert (first.vertices == second.vertices).all()
+def test_skipped_shapes_are_counted_and_named(cli, trainer, tmp_path, monkeypatch, library):
+    skipped = replace(library, skipped=(("bad.ply", "it has no faces"),))
+    monkeypatch.setattr("utopic_cli.synthesis.packing.open_shapes", lambda data, progress: skipped)
+    result = cli("train", "--out", tmp_path / "run", "--data", tmp_path)
+    assert result.exit_code == 0, result.output
+    (line,) = [line for line in result.stderr.splitlines() if "warning" in line]
+    assert line.startswith("utopic: warning: skipped 1 shape") and "bad.ply: it has no faces" in line
 
 
 @pytest.mark.parametrize("place", ["file", "file/run", "file/deeper/run"])
@@ -85,4 +175,16 @@ def test_out_must_be_a_folder(cli, trainer, tmp_path, place):
 
 def test_a_record_is_one_line():
     record = {"pairs": 1, "of": 2, "stage": "descriptor", "elapsed_s": 6.0, "pairs_per_s": 3.21}
-    assert describe(record) == "1/2 pairs, descriptor, 0.1 min, pairs_per_s 3.21"
+    assert describe(record) == "1/2 pairs, descriptor, 0:06, pairs/s 3.21"
+
+
+def test_durations():
+    assert [clock(seconds) for seconds in (-3, 59.6, 3599, 3600)] == ["0:00", "1:00", "59:59", "1:00:00"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "arrow"), [(0.25, 0.5, " ▲25.0"), (0.5, 0.25, " ▼25.0"), (0.5, 0.50001, " =")]
+)
+def test_the_change_of_a_validation_is_told(before, after, arrow):
+    line = describe({**RECORD, "hit_rate": after}, {"hit_rate": before})
+    assert line.endswith(f"hit rate {100 * after:.1f} %{arrow}")

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from utopic_cli.geometry import rigid
+from utopic_cli.model.cloud_input import CloudInput
 from utopic_cli.model.uncertainty import OverlapDistribution
 from utopic_cli.training.completion import CompletionDecoder, canonical_frame
 from utopic_cli.training.labels import Labels, label_pair, mutual_nearest
@@ -27,7 +28,15 @@ def hard_labels(correspondences: torch.Tensor) -> Labels:
         torch.zeros_like(correspondences, dtype=torch.bool),
         (correspondences.sum(2) > 0).float(),
         (correspondences.sum(1) > 0).float(),
+        torch.ones_like(correspondences[:, :, 0]),
+        torch.ones_like(correspondences[:, 0]),
     )
+
+
+def bare_cloud(points: torch.Tensor, spacing: float, valid: torch.Tensor | None = None) -> CloudInput:
+    """What labels need of a cloud: points (B, N, 3), spacing, validity."""
+    nothing = torch.zeros(0)
+    return CloudInput(points, nothing, torch.full((len(points),), spacing), nothing, (), (), valid)
 
 
 def test_labels_equal_brute_force():
@@ -37,10 +46,9 @@ def test_labels_equal_brute_force():
     source = rigid.apply(rigid.invert(gt), np.concatenate([target[:25] + 0.02, rng.uniform(4, 5, (10, 3))]))
     spacing = 0.3
     labels = label_pair(
-        torch.from_numpy(source)[None],
-        torch.from_numpy(target)[None],
+        bare_cloud(torch.from_numpy(source)[None], spacing),
+        bare_cloud(torch.from_numpy(target)[None], spacing),
         torch.from_numpy(gt)[None],
-        torch.tensor([spacing]),
     )
     moved = rigid.apply(gt, source)
     distance = np.linalg.norm(moved[:, None] - target[None], axis=2) / spacing
@@ -64,14 +72,16 @@ def test_labels_equal_brute_force():
 def test_mutual_nearest_needs_both_sides_and_the_radius():
     source = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [5.0, 0, 0]]])
     target = torch.tensor([[[0.02, 0, 0], [5.2, 0, 0]]])
-    assert mutual_nearest(source, target, 0.075).tolist() == [[[1, 0], [0, 0], [0, 0]]]
-    assert mutual_nearest(source, target, 0.5).tolist() == [[[1, 0], [0, 0], [0, 1]]]
+    distance = torch.cdist(source, target)
+    assert mutual_nearest(distance, 0.075).tolist() == [[[1, 0], [0, 0], [0, 0]]]
+    assert mutual_nearest(distance, 0.5).tolist() == [[[1, 0], [0, 0], [0, 1]]]
 
 
 def test_the_papers_labels_are_hard_and_within_their_radius():
     source = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [5.0, 0, 0]]])
     target = torch.tensor([[[0.02, 0, 0], [5.2, 0, 0]]])
-    labels = label_pair(source, target, torch.eye(4)[None], torch.tensor([0.2]), hard_radius=0.075)
+    clouds = (bare_cloud(source, 0.2), bare_cloud(target, 0.2))
+    labels = label_pair(*clouds, torch.eye(4)[None], hard_radius=0.075)
     assert labels.correspondences.tolist() == [[[1, 0], [0, 0], [0, 0]]]
     assert labels.source_overlap.tolist() == [[1, 0, 0]]
     assert labels.target_overlap.tolist() == [[1, 0]]
@@ -113,7 +123,7 @@ def test_uncertainty_loss_grows_for_confident_wrong_points_and_narrow_gaussians(
         distribution = OverlapDistribution(
             torch.tensor([[mean]]), torch.tensor([[log_variance]]), samples, torch.zeros(1, 1)
         )
-        return float(uncertainty_loss(distribution, torch.tensor([[overlap]])))
+        return float(uncertainty_loss(distribution, torch.tensor([[overlap]]), torch.ones(1, 1)))
 
     assert loss(0.0, 0.0, 1.0) == pytest.approx(0.5 * math.log(2))  # KL of N(0, 1) to itself is 0
     assert loss(2.0, 0.0, 0.0) > loss(2.0, 0.0, 1.0)
@@ -123,7 +133,8 @@ def test_uncertainty_loss_grows_for_confident_wrong_points_and_narrow_gaussians(
 def test_chamfer_loss_of_two_known_clouds():
     predicted, expected = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]]), torch.tensor([[[0.0, 0, 1.0]]])
     forward, backward = (1 + math.sqrt(2)) / 2, 1.0
-    assert float(chamfer_loss(predicted, expected)) == pytest.approx(0.5 * (forward + backward), rel=1e-5)
+    loss = chamfer_loss(predicted, expected, torch.ones(1, 1))
+    assert float(loss) == pytest.approx(0.5 * (forward + backward), rel=1e-5)
 
 
 def test_the_canonical_frame_moves_with_the_cloud():
@@ -133,7 +144,7 @@ def test_the_canonical_frame_moves_with_the_cloud():
     coordinates = []
     for cloud in (points, rigid.apply(pose, points)):
         tensor = torch.from_numpy(cloud)[None]
-        centre, axes = canonical_frame(tensor)
+        centre, axes = canonical_frame(tensor, torch.ones_like(tensor[..., 0]))
         assert float(torch.linalg.det(axes[0])) == pytest.approx(1.0)
         coordinates.append((tensor - centre) @ axes)
     torch.testing.assert_close(coordinates[0], coordinates[1], atol=1e-8, rtol=1e-6)
@@ -142,3 +153,43 @@ def test_the_canonical_frame_moves_with_the_cloud():
 def test_the_completion_decoder_makes_the_sizes_it_promises():
     coarse, fine = CompletionDecoder(16, coarse=32, folds=4)(torch.randn(2, 50, 16))
     assert coarse.shape == (2, 32, 3) and fine.shape == (2, 128, 3)
+
+
+def test_nodes_that_fill_a_batch_up_are_no_part_of_any_answer():
+    rng = np.random.default_rng(4)
+    source, target = (torch.from_numpy(rng.uniform(-1, 1, (1, 30, 3))).float() for _ in range(2))
+    valid = torch.arange(30)[None] < 22
+    filled = label_pair(bare_cloud(source, 0.5, valid), bare_cloud(target, 0.5), torch.eye(4)[None])
+    alone = label_pair(bare_cloud(source[:, :22], 0.5), bare_cloud(target, 0.5), torch.eye(4)[None])
+    torch.testing.assert_close(filled.correspondences[:, :22], alone.correspondences)
+    assert not filled.correspondences[:, 22:].any() and filled.ignored[:, 22:].all()
+    torch.testing.assert_close(filled.target_overlap, alone.target_overlap)
+    similarity = torch.from_numpy(rng.uniform(-1, 1, (1, 30, 30))).float()
+    scale = torch.tensor(5.0)
+    torch.testing.assert_close(
+        descriptor_loss(similarity, scale, filled), descriptor_loss(similarity[:, :22], scale, alone)
+    )
+    logits, other = similarity[:, :, 0], similarity[:, :, 1]
+    torch.testing.assert_close(
+        overlap_loss(logits, other, filled), overlap_loss(logits[:, :22], other, alone)
+    )
+    torch.testing.assert_close(
+        chamfer_loss(target, source, valid.float()), chamfer_loss(target, source[:, :22], torch.ones(1, 22))
+    )
+    frames = (canonical_frame(source, valid.float()), canonical_frame(source[:, :22], torch.ones(1, 22)))
+    torch.testing.assert_close(frames[0], frames[1])
+    features = torch.randn(1, 30, 16)
+    decoder = CompletionDecoder(16, coarse=8, folds=4)
+    torch.testing.assert_close(decoder(features, valid), decoder(features[:, :22]))
+
+
+def test_a_loss_is_a_mean_over_pairs():
+    rng = np.random.default_rng(6)
+    similarity = torch.from_numpy(rng.uniform(-1, 1, (2, 5, 5))).float()
+    partners = torch.stack([torch.eye(5), torch.diag(torch.tensor([1.0, 0, 0, 0, 0]))])
+    both = hard_labels(partners)
+    each = [
+        descriptor_loss(similarity[i : i + 1], torch.tensor(5.0), hard_labels(partners[i : i + 1]))
+        for i in (0, 1)
+    ]
+    assert float(descriptor_loss(similarity, torch.tensor(5.0), both)) == pytest.approx(float(sum(each)) / 2)

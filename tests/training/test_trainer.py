@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -17,15 +19,22 @@ from utopic_cli.synthesis.pairs import PairSettings, random_pair, surface_pair
 from utopic_cli.synthesis.shapes import procedural_shapes
 from utopic_cli.training import trainer
 from utopic_cli.training.checkpoint import read_checkpoint
-from utopic_cli.training.config import Schedule, TrainingConfig, read_training_config
+from utopic_cli.training.config import (
+    Schedule,
+    TrainingConfig,
+    read_training_config,
+    training_config_from,
+)
 from utopic_cli.training.data import (
     BLOCK,
-    PairKeys,
+    Batch,
+    BatchOrder,
     SynthesisedPairs,
     sample_pair,
     to_training_pair,
 )
 from utopic_cli.training.network import TrainingNetwork, total_loss
+from utopic_cli.training.optimisation import learning_rate
 
 SCHEDULE = Schedule(
     descriptor_pairs=4,
@@ -74,6 +83,37 @@ def test_the_export_is_the_average_of_the_weights(shapes, tmp_path):
     assert records[-1]["pairs"] == 8 and 0 <= records[-1]["hit_rate"] <= 1
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_the_step_in_hand(shapes, tmp_path, number):
+    def interrupt(record):
+        if record["pairs"] == 0:
+            os.kill(os.getpid(), number)
+
+    before = signal.getsignal(number)
+    if number == signal.SIGINT:
+        with pytest.raises(KeyboardInterrupt):
+            run(shapes, tmp_path, progress=interrupt)
+    else:
+        run(shapes, tmp_path, progress=interrupt)
+    assert signal.getsignal(number) == before
+    assert read_checkpoint(tmp_path / "checkpoint.pt")["pairs"] == SCHEDULE.batch
+    assert (tmp_path / "utopic.safetensors").is_file()
+
+
+def test_the_journal_starts_with_the_untrained_network(shapes, tmp_path):
+    records = []
+    run(shapes, tmp_path, minutes=0.0, progress=records.append)
+    assert [record["pairs"] for record in records] == [0, SCHEDULE.batch]
+    assert "hit_rate" in records[0] and "match_rate" not in records[0]  # only what the stage trains
+    assert records[1]["left_s"] == 0 and 0 <= records[1]["waiting"] <= 1
+
+
+def test_weights_of_another_architecture_are_refused(shapes, tmp_path):
+    other = TrainingNetwork(ModelConfig(**{**SMALL, "feature_width": 24})).inference.state_dict()
+    with pytest.raises(InputError, match="another architecture: .*: .*, now "):
+        run(shapes, tmp_path, start_from=other)
+
+
 def test_one_pair_can_be_learnt_by_heart(shapes):
     torch.manual_seed(0)
     config = dataclasses.replace(CONFIG.model, descriptor_width=16, feature_width=32)
@@ -116,7 +156,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_checkpoint(shapes,
     monkeypatch.setattr(
         trainer, "_losses", lambda *_: {"descriptor": torch.tensor(float("nan"), requires_grad=True)}
     )
-    with pytest.raises(trainer.DivergedError, match="the loss is nan at pair 2"):
+    with pytest.raises(trainer.DivergedError, match="the loss is nan at step 1, pairs 2 to 3"):
         run(shapes, tmp_path, resume=True)
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
@@ -126,37 +166,54 @@ def test_resuming_needs_a_sound_checkpoint_of_the_same_settings(shapes, tmp_path
         run(shapes, tmp_path, resume=True)
     run(shapes, tmp_path, minutes=0.0)
     other = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, joint_rate=0.5))
-    with pytest.raises(InputError, match="made with other settings"):
+    with pytest.raises(
+        InputError, match=r"made with other settings \(schedule.joint_rate: 0.0008, now 0.5\)"
+    ):
         run(shapes, tmp_path, config=other, resume=True)
     (tmp_path / "checkpoint.pt").write_bytes(b"garbage")
     with pytest.raises(InputError, match="not a readable checkpoint"):
         run(shapes, tmp_path, resume=True)
 
 
-def test_pairs_depend_on_seed_and_number_alone(shapes):
+def test_batches_depend_on_seed_and_number_alone(shapes):
     def points(seed, number):
         pairs = SynthesisedPairs(shapes, PairSettings(), seed, 6)
-        return pairs[(number, 60, 80)].source.points
+        return pairs[Batch(number, 2, 60, 80)].source.points
 
     assert torch.equal(points(1, 5), points(1, 5))
     assert points(1, 5).shape != points(1, 6).shape or not torch.equal(points(1, 5), points(1, 6))
     assert points(1, 5).shape != points(2, 5).shape or not torch.equal(points(1, 5), points(2, 5))
 
 
-def test_each_pair_is_shown_as_often_as_asked_whatever_the_start():
-    def keys(start):
-        return list(PairKeys(start, 4 * BLOCK, 2, lambda sample: (50, sample)))
+def test_a_pair_is_the_same_in_whatever_batch(shapes):
+    pairs = SynthesisedPairs(shapes, PairSettings(), 1, 6)
+    both, second = pairs[Batch(4, 2, 70, 70)], pairs[Batch(5, 1, 70, 70)]
+    count = second.source.points.shape[1]
+    assert torch.equal(both.source.points[1, :count], second.source.points[0])
+    assert torch.equal(both.gt_T_target_source[1], second.gt_T_target_source[0])
+    if both.source.valid is not None:
+        assert both.source.valid[1].sum() == count
 
-    everything = keys(0)
-    numbers = [number for number, _, _ in everything]
-    assert numbers == [*range(BLOCK), *range(BLOCK), *range(BLOCK, 2 * BLOCK), *range(BLOCK, 2 * BLOCK)]
+
+def test_each_pair_is_shown_as_often_as_asked_whatever_the_start():
+    def batches(start, share=(0, 1)):
+        return list(BatchOrder(start, 4 * BLOCK, 6, 2, lambda shown: (50, 50 + shown), share))
+
+    everything = batches(0)
+    numbers = [batch.first for batch in everything]
+    block = list(range(0, 6 * BLOCK, 6))
+    assert numbers == [*block, *block, *(n + 6 * BLOCK for n in block), *(n + 6 * BLOCK for n in block)]
     assert everything[: 2 * BLOCK][BLOCK:] == everything[:BLOCK]  # shown again with the same settings
-    assert keys(37) == everything[37:]
+    assert batches(37) == everything[37:]
+    shares = [batches(0, (rank, 3)) for rank in range(3)]
+    for whole, *parts in zip(everything, *shares, strict=True):  # every pair is in one share
+        assert [batch.first for batch in parts] == [whole.first, whole.first + 2, whole.first + 4]
+        assert all(batch.count == 2 and batch.most == whole.most for batch in parts)
 
 
 def test_the_rate_warms_up_and_falls_in_each_stage():
     schedule = Schedule(descriptor_pairs=1000, joint_pairs=1000)
-    rates = [trainer.learning_rate(schedule, pairs) for pairs in range(2000)]
+    rates = [learning_rate(schedule, pairs) for pairs in range(2000)]
     assert rates[0] < 0.05 * schedule.descriptor_rate
     assert max(rates[:1000]) <= schedule.descriptor_rate and max(rates[1000:]) <= schedule.joint_rate
     assert rates[999] < 0.1 * schedule.descriptor_rate and rates[1999] < 0.1 * schedule.joint_rate
@@ -172,7 +229,8 @@ def test_shipped_configurations_are_read(name):
     ("text", "message"),
     [
         ("[model]\nwidth = 3", r"unknown key width; known keys: .*feature_width"),
-        ("[optimizer]\nlr = 1", r"unknown section optimizer; known: model, loss, schedule"),
+        ("[optimizer]\nlr = 1", r"unknown section optimizer; known: model, loss, schedule, pairs"),
+        ("[pairs]\nbands = 0.5", r"bands is 0.5; expected tuple"),
         ("[schedule]\nbatch = 'two'", r"batch is 'two'; expected int"),
         ("model = [", "not valid TOML"),
         ("[schedule]\noptimiser = 'adam'", "optimiser is 'adam'; choose adamw, sgd"),
@@ -190,3 +248,14 @@ def test_a_configuration_that_makes_no_sense_is_explained(tmp_path, text, messag
 def test_an_unknown_configuration_name_lists_those_there_are():
     with pytest.raises(InputError, match="there are: default, paper"):
         read_training_config("fast")
+
+
+def test_a_configuration_survives_being_written_as_json():
+    config = read_training_config("default")
+    assert training_config_from(json.loads(json.dumps(config.as_dict())), "test") == config
+
+
+def test_the_papers_rate_falls_in_steps():
+    schedule = Schedule(descriptor_pairs=0, joint_pairs=1000, rate_steps=(0.6, 0.7), joint_rate=1e-3)
+    rates = [learning_rate(schedule, pairs) for pairs in (300, 599, 600, 699, 700, 999)]
+    assert rates == pytest.approx([1e-3, 1e-3, 2e-4, 2e-4, 4e-5, 4e-5])

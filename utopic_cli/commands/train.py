@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,20 +15,21 @@ if TYPE_CHECKING:
     from utopic_cli.synthesis.shapes import ShapeLibrary
 
 RUN_FILES = ("checkpoint.pt", "utopic.safetensors", "utopic.json")
+"""What may not be lost: curves and records without a checkpoint belong to a run that never got so far."""
+
 PROCEDURAL = "procedural"
-PROCEDURAL_SHAPES = 200
-PROCEDURAL_RESOLUTION = 32  # detail comes from the random warps
-PROCEDURAL_SEED = 20221015  # another stream than any training seed; the shapes are always the same
 
 
 def train(
     out: Annotated[
-        Path, typer.Option(metavar="RUN", help="Folder of the run: checkpoint, log, exported weights.")
+        Path,
+        typer.Option(metavar="RUN", help="Folder of the run: checkpoint, records, curves, exported weights."),
     ],
     data: Annotated[
         str,
         typer.Option(
-            metavar="procedural|DIR", help="Shapes made on the fly, or a folder of packed meshes (.npz)."
+            metavar="procedural|DIR|modelnet40:DIR",
+            help="Shapes made on the fly, a folder of meshes or clouds of your own, or ModelNet40.",
         ),
     ] = PROCEDURAL,
     config: Annotated[
@@ -51,33 +53,42 @@ def train(
     """Train a network and export its weights.
 
     Checkpoints survive a kill: run the same command with --resume to go on.
-    """
-    check_run(out, resume)
-    console = Console(quiet=quiet)
-    from utopic_cli.model.weights import choose_device, load_weights
-    from utopic_cli.training.config import read_training_config
-    from utopic_cli.training.trainer import train as run_training
+    Open RUN/curves.html at any time to see how far it is.
 
-    settings = read_training_config(config)
-    place = choose_device(device)
-    first = load_weights(start_from)[0].state_dict() if start_from else None
-    console.line("making procedural shapes" if data == PROCEDURAL else f"reading shapes from {data}")
-    shapes = load_library(data)
+    Example: utopic train --out first --minutes 5
+    """
+    # torchrun starts this several times; one of them writes and speaks for all.
+    leads = os.environ.get("RANK", "0") == "0"
+    if leads:
+        check_run(out, resume)
+    console = Console(quiet=quiet or not leads)
+    with console.progress() as step:
+        step("loading libraries")
+        from utopic_cli.commands.training_view import TrainingView
+        from utopic_cli.model.weights import choose_device, load_weights
+        from utopic_cli.training.config import read_training_config
+        from utopic_cli.training.trainer import train as run_training
+
+        settings = read_training_config(config)
+        place = choose_device(device)
+        first = load_weights(start_from)[0].state_dict() if start_from else None
+    shapes = load_library(data, console)
     console.line(f"training on {place} with {len(shapes)} shapes")
-    written = run_training(
-        settings,
-        shapes.select("train"),
-        shapes.select("val"),
-        out,
-        resume=resume,
-        minutes=minutes,
-        device=place,
-        workers=workers,
-        start_from=first,
-        progress=lambda record: console.line(describe(record)),
-    )
-    console.line(f"wrote {written}")
-    console.line(f"use it: utopic align SOURCE TARGET --weights {written}")
+    with TrainingView(console) as view:
+        written = run_training(
+            settings,
+            shapes.select("train"),
+            shapes.select("val"),
+            out,
+            resume=resume,
+            minutes=minutes,
+            device=place,
+            workers=workers,
+            start_from=first,
+            progress=view.show,
+        )
+    for line in (view.outcome(), *describe_files(out, written)):
+        console.line(line)
 
 
 def check_run(out: Path, resume: bool) -> None:
@@ -99,27 +110,33 @@ def check_run(out: Path, resume: bool) -> None:
     check_writable([there / RUN_FILES[0]], overwrite=True)
 
 
-def load_library(data: str) -> ShapeLibrary:
-    """Return the shapes to train on.
+def load_library(data: str, console: Console) -> ShapeLibrary:
+    """Return the shapes to train on, and say which were skipped.
 
     Args:
-        data: ``procedural``, or the path of packed meshes.
+        data: ``procedural``, a folder of shapes, or ``modelnet40:DIR``.
+        console: told how far it is.
 
     Raises:
         InputError: nothing usable is there.
     """
-    import numpy as np
+    console.line("making procedural shapes" if data == PROCEDURAL else f"reading shapes from {data}")
+    from utopic_cli.synthesis.packing import describe_skipped, open_shapes
 
-    from utopic_cli.synthesis.shapes import load_shapes, procedural_shapes
+    with console.progress() as step:
+        step("looking")
+        shapes = open_shapes(data, progress=lambda done, of, name: step(f"{done}/{of} shapes: {name}"))
+    skipped = describe_skipped(shapes)
+    if skipped:
+        console.warnings((skipped,))
+    return shapes
 
-    if data == PROCEDURAL:
-        rng = np.random.default_rng(PROCEDURAL_SEED)
-        return procedural_shapes(rng, PROCEDURAL_SHAPES, PROCEDURAL_RESOLUTION)
-    return load_shapes(data)
 
-
-def describe(record: dict[str, Any]) -> str:
-    """Return one record of the training log as one line."""
-    head = f"{record['pairs']}/{record['of']} pairs, {record['stage']}, {record['elapsed_s'] / 60:.1f} min"
-    terms = {k: v for k, v in record.items() if k not in ("pairs", "of", "stage", "elapsed_s")}
-    return ", ".join([head, *(f"{name} {value:g}" for name, value in terms.items())])
+def describe_files(out: Path, weights: Path) -> list[str]:
+    """Say where everything is that a run left, one line each."""
+    lines = [f"wrote {weights}; use it: utopic align SOURCE TARGET --weights {weights}"]
+    if (out / "curves.html").is_file():
+        lines.append(f"curves: {out / 'curves.html'}")
+    if (out / "tensorboard").is_dir():
+        lines.append(f"TensorBoard: tensorboard --logdir {out / 'tensorboard'}")
+    return lines

@@ -4,7 +4,9 @@ Training, benchmark and demo share this room. A mesh (from a packed library or p
 is sampled densely, stretched and warped into something organic, seen by a virtual range
 scanner from two sides, thinned, disturbed and moved by two random rigid motions.
 
-- ``shapes``: libraries of triangle meshes; ``procedural``, ``implicit``: meshes made here.
+- ``shapes``: libraries of triangle meshes; ``packing``: opens or makes one from what a user names
+  (``shape_files``, ``mesh_form``, ``reconstruction`` of clouds, ``modelnet40``).
+- ``procedural``, its ``families`` and ``implicit`` solids: meshes made here.
 - ``surface``, ``warp``: a mesh as a dense sample; smooth deformations of it.
 - ``scanner``: what a range scanner sees of it. ``crops``: the paper's way to cut it.
 - ``pairs``: the mixture (``random_pair``) and the seeded test pairs (``evaluation_pairs``);

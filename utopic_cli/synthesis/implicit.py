@@ -113,3 +113,60 @@ def blend(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 def carve(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
     """Take solid ``b`` out of solid ``a``, with an edge rounded by about ``width``."""
     return -blend(-a, b, width)
+
+
+def prism(points: np.ndarray, corners: np.ndarray, half_height: float) -> np.ndarray:
+    """Distance of a polygon (P, 2) in the first two axes, extruded along the third."""
+    flat = points[..., :2].reshape(-1, 2).astype(np.float32)
+    nearest = np.full(len(flat), np.inf, dtype=np.float32)
+    inside = np.zeros(len(flat), dtype=bool)
+    for a, b in zip(corners.astype(np.float32), np.roll(corners, -1, axis=0).astype(np.float32)):
+        side, offset = b - a, flat - a
+        along = np.clip(offset @ side / max(float(side @ side), 1e-9), 0.0, 1.0)
+        apart = offset - along[:, None] * side
+        nearest = np.minimum(nearest, np.einsum("nd,nd->n", apart, apart))
+        crosses = (a[1] > flat[:, 1]) != (b[1] > flat[:, 1])  # even-odd rule
+        left = side[0] * offset[:, 1] - side[1] * offset[:, 0] > 0
+        inside ^= crosses & (left == (b[1] > a[1]))
+    outline = (np.sqrt(nearest) * np.where(inside, -1.0, 1.0)).reshape(points.shape[:-1])
+    return np.maximum(outline, np.abs(points[..., 2]) - half_height).astype(np.float32)
+
+
+def post(points: np.ndarray, centre: tuple[float, float], radius: float, half_height: float) -> np.ndarray:
+    """Distance of an upright cylinder (a hole, when carved), ``half_height`` to both sides of 0."""
+    across = np.hypot(points[..., 0] - centre[0], points[..., 1] - centre[1]) - radius
+    return np.maximum(across, np.abs(points[..., 2]) - half_height)
+
+
+def gyroid(points: np.ndarray, wavelength: float, thickness: float) -> np.ndarray:
+    """Distance-like function of a gyroid's wall, which fills all space."""
+    wave = 2.0 * np.pi / wavelength
+    sine, cosine = np.sin(wave * points), np.cos(wave * points)
+    level = np.einsum("...d,...d->...", sine, np.roll(cosine, -1, axis=-1))
+    return np.abs(level) / wave / 1.5 - thickness / 2.0
+
+
+def struts(points: np.ndarray, spacing: float, radius: float) -> np.ndarray:
+    """Distance of round rods along the edges of a cubic lattice, which fill all space."""
+    local = points - spacing * np.round(points / spacing)
+    square = local * local
+    return np.sqrt(square.sum(axis=-1) - square.max(axis=-1)) - radius
+
+
+def bend(points: np.ndarray, curvature: float) -> np.ndarray:
+    """Return where points were before the first axis was bent towards the third."""
+    if abs(curvature) < 1e-3:
+        return points
+    x, y, z = (points[..., i] for i in range(3))
+    centre = 1.0 / curvature
+    side = np.sign(centre)  # the axis is below the centre, or above it
+    radius = side * np.hypot(x, centre - z)
+    angle = np.arctan2(x, side * (centre - z))
+    return np.stack([angle * abs(centre), y, centre - radius], axis=-1).astype(np.float32)
+
+
+def twist(points: np.ndarray, rate: float) -> np.ndarray:
+    """Return where points were before a twist about the third axis, ``rate`` radians a unit."""
+    x, y, z = (points[..., i] for i in range(3))
+    cosine, sine = np.cos(rate * z), np.sin(rate * z)
+    return np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=-1).astype(np.float32)

@@ -9,7 +9,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class PairSettings:
-    """Settings of the pair mixture. The defaults are the training mixture.
+    """Settings of the pair mixture. The defaults are what validation uses.
 
     Lengths are shares of the object's *extent* (the diagonal of its bounding box) unless said
     otherwise. A range is drawn from uniformly unless said otherwise.
@@ -36,6 +36,8 @@ class PairSettings:
         grazing_cosine: surfaces seen at a smaller cosine return nothing.
         noise: standard deviation of the range error along the ray; drawn as high * u^2, so
             that most scans are clean. Cut off at three standard deviations.
+        rough_probability: share of scans whose noise is drawn from ``rough_noise`` instead.
+        rough_noise: see above.
         slant_probability: share of scans whose density falls with the cosine of the viewing
             angle, as on a scanner's regular raster.
         ramp_probability: share of scans whose density changes across the object, up to 5 : 1.
@@ -52,6 +54,7 @@ class PairSettings:
         surface_noise: jitter per coordinate in units of the object's radius, cut off at
             ``surface_clip``.
         surface_clip: see above.
+        surface_rotations: ``uniform`` over SO(3), or the paper's ``euler45``.
         patch_points: points per cloud of patch pairs, log-uniform.
         patch_keep: share of the whole surface in each patch.
         attempts: draws tried before giving up on a pair.
@@ -73,6 +76,8 @@ class PairSettings:
     dense_samples: tuple[int, int, int] = (4, 80_000, 140_000)
     grazing_cosine: Range = (0.1, 0.25)
     noise: Range = (0.0, 0.004)
+    rough_probability: float = 0.0
+    rough_noise: Range = (0.004, 0.02)
     slant_probability: float = 0.5
     ramp_probability: float = 0.25
     hole_probability: float = 0.25
@@ -86,6 +91,7 @@ class PairSettings:
     surface_keep: Range = (0.5, 0.9)
     surface_noise: Range = (0.0, 0.01)
     surface_clip: float = 0.05
+    surface_rotations: str = "uniform"
     patch_points: tuple[int, int] = (4000, 20000)
     patch_keep: Range = (0.2, 0.5)
     attempts: int = 30

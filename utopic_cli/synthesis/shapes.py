@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from utopic_cli.errors import InputError
 from utopic_cli.synthesis.procedural import procedural_mesh
 
 ARRAYS = ("vertices", "faces", "vertex_start", "face_start", "names", "split")
+MORE_ARRAYS = ("sets", "samples", "skipped")
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,11 @@ class ShapeLibrary:
         vertex_start: (N + 1,) int64, mesh i has vertices[vertex_start[i] : vertex_start[i + 1]].
         face_start: (N + 1,) int64, likewise for faces.
         names: (N,) str.
-        splits: (N,) str, ``train`` or ``val``.
+        splits: (N,) str, ``train``, ``val`` or (ModelNet40 only) ``test``.
         sets: (N,) str, the collection each mesh comes from.
+        samples: (N, S, 3) float16, the points that each mesh was reconstructed from, in the
+            frame of its vertices, where a data set gives points; None for meshes.
+        skipped: (name, reason) of each shape that was there but could not be used.
     """
 
     vertices: np.ndarray
@@ -36,6 +40,8 @@ class ShapeLibrary:
     names: np.ndarray
     splits: np.ndarray
     sets: np.ndarray
+    samples: np.ndarray | None = None
+    skipped: tuple[tuple[str, str], ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -57,7 +63,9 @@ class ShapeLibrary:
             known = ", ".join(sorted(set(self.splits.tolist())))
             raise InputError(f"the shape library has no '{split}' shapes; its splits: {known or 'none'}")
         meshes = [self.mesh(int(i)) for i in chosen]
-        return pack(meshes, self.names[chosen], self.splits[chosen], self.sets[chosen])
+        packed = pack(meshes, self.names[chosen], self.splits[chosen], self.sets[chosen])
+        samples = None if self.samples is None else self.samples[chosen]
+        return replace(packed, samples=samples, skipped=self.skipped)
 
     def draw(self, rng: np.random.Generator) -> int:
         """Draw a mesh number: a set by the square root of its size, then any mesh of it.
@@ -109,7 +117,8 @@ def load_shapes(path: str | Path) -> ShapeLibrary:
     """Read packed meshes.
 
     Each ``.npz`` holds one set: vertices (V, 3), faces (F, 3) numbered within each mesh,
-    vertex_start and face_start (N + 1), names and split (N).
+    vertex_start and face_start (N + 1), names and split (N). It may also hold sets (N), where
+    it has several, samples (N, S, 3), and skipped (K, 2) names and reasons.
 
     Args:
         path: a ``.npz`` file, a folder of them, or a folder whose ``meshes`` holds them.
@@ -117,13 +126,12 @@ def load_shapes(path: str | Path) -> ShapeLibrary:
     Raises:
         InputError: nothing there, or a file is not of this form.
     """
-    root = Path(path)
-    if (root / "meshes").is_dir():
-        root = root / "meshes"
-    files = [root] if root.is_file() else sorted(root.glob("*.npz"))
+    files = packed_files(Path(path))
     if not files:
         raise InputError(f"{path}: no .npz file of packed meshes here")
     loaded = [_read(file) for file in files]
+    samples = [one["samples"] for one in loaded if "samples" in one]
+    skipped = [tuple(row) for one in loaded for row in one.get("skipped", np.empty((0, 2))).tolist()]
     return ShapeLibrary(
         np.concatenate([one["vertices"] for one in loaded]),
         np.concatenate([one["faces"] for one in loaded]),
@@ -131,8 +139,17 @@ def load_shapes(path: str | Path) -> ShapeLibrary:
         _joined_starts([one["face_start"] for one in loaded]),
         np.concatenate([one["names"] for one in loaded]),
         np.concatenate([one["split"] for one in loaded]),
-        np.concatenate([np.full(len(one["names"]), file.stem) for one, file in zip(loaded, files)]),
+        np.concatenate([one["sets"] for one in loaded]),
+        np.concatenate(samples) if len(samples) == len(loaded) else None,
+        tuple(skipped),
     )
+
+
+def packed_files(root: Path) -> list[Path]:
+    """List the ``.npz`` files that ``load_shapes`` reads for a file or folder; may be none."""
+    if root.is_file():
+        return [root]
+    return sorted((root / "meshes").glob("*.npz")) or sorted(root.glob("*.npz"))
 
 
 def _read(file: Path) -> dict[str, np.ndarray]:
@@ -141,9 +158,10 @@ def _read(file: Path) -> dict[str, np.ndarray]:
             missing = [name for name in ARRAYS if name not in packed]
             if missing:
                 raise InputError(f"{file}: not packed meshes: no array {', '.join(missing)}")
-            arrays = {name: packed[name] for name in ARRAYS}
+            arrays = {name: packed[name] for name in (*ARRAYS, *MORE_ARRAYS) if name in packed}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{file}: can't be read as packed meshes: {error}") from error
+    arrays.setdefault("sets", np.full(len(arrays["names"]), file.stem))
     _check(file, arrays)
     return arrays
 
@@ -155,7 +173,11 @@ def _check(file: Path, arrays: dict[str, np.ndarray]) -> None:
         len(starts) == count + 1 and starts[0] == 0 and starts[-1] == total and (np.diff(starts) > 0).all()
         for starts, total in ((arrays["vertex_start"], len(vertices)), (arrays["face_start"], len(faces)))
     )
-    shapes_fit = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,) and len(arrays["split"]) == count
+    shapes_fit = (
+        vertices.shape[1:] == (3,)
+        and faces.shape[1:] == (3,)
+        and all(len(arrays[name]) == count for name in ("split", "sets", "samples") if name in arrays)
+    )
     if not (starts_fit and shapes_fit):
         raise InputError(f"{file}: the packed meshes' arrays don't fit together")
     if not np.isfinite(vertices).all():

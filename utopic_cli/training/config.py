@@ -9,6 +9,7 @@ from typing import Any
 
 from utopic_cli.config import ModelConfig, from_dict, to_dict
 from utopic_cli.errors import InputError
+from utopic_cli.synthesis.settings import PairSettings
 from utopic_cli.training.network import LossWeights
 
 if sys.version_info >= (3, 11):
@@ -33,7 +34,9 @@ class Schedule:
         optimiser: ``adamw`` or ``sgd`` (Nesterov momentum 0.9).
         descriptor_rate: highest learning rate of the first stage.
         joint_rate: highest learning rate of the second stage.
-        matching_rate: factor on the rate of gains and biases (``trainer.FAST``).
+        rate_steps: shares of each stage after which the rate is multiplied by 0.2 (the paper's);
+            none: a cosine.
+        matching_rate: factor on the rate of gains and biases (``optimisation.FAST``).
         weight_decay: decoupled weight decay.
         clip: largest gradient norm.
         masking_from: share of the joint stage after which random masking starts.
@@ -54,6 +57,7 @@ class Schedule:
     optimiser: str = "adamw"
     descriptor_rate: float = 2.5e-3
     joint_rate: float = 8e-4
+    rate_steps: tuple[float, ...] = ()
     matching_rate: float = 20.0
     weight_decay: float = 1e-4
     clip: float = 1.0
@@ -112,15 +116,25 @@ class LossSettings:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """One training run."""
+    """One training run: the network, the losses, the schedule, and the pairs it learns from."""
 
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossSettings = field(default_factory=LossSettings)
     schedule: Schedule = field(default_factory=Schedule)
+    pairs: PairSettings = field(default_factory=PairSettings)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as plain data."""
-        return {section: to_dict(getattr(self, section)) for section in ("model", "loss", "schedule")}
+        return {section: to_dict(getattr(self, section)) for section in SECTIONS}
+
+
+SECTIONS: dict[str, type] = {
+    "model": ModelConfig,
+    "loss": LossSettings,
+    "schedule": Schedule,
+    "pairs": PairSettings,
+}
+"""The sections of a configuration, and of a TOML file."""
 
 
 def training_config_from(values: dict[str, Any], where: str) -> TrainingConfig:
@@ -129,12 +143,11 @@ def training_config_from(values: dict[str, Any], where: str) -> TrainingConfig:
     Raises:
         InputError: an unknown section or key (the known ones are listed), or a wrong type.
     """
-    kinds: dict[str, type] = {"model": ModelConfig, "loss": LossSettings, "schedule": Schedule}
-    unknown = sorted(set(values) - set(kinds))
+    unknown = sorted(set(values) - set(SECTIONS))
     if unknown:
-        raise InputError(f"{where}: unknown section {', '.join(unknown)}; known: {', '.join(kinds)}")
+        raise InputError(f"{where}: unknown section {', '.join(unknown)}; known: {', '.join(SECTIONS)}")
     built: dict[str, Any] = {
-        name: from_dict(kind, values.get(name, {}), f"{where} [{name}]") for name, kind in kinds.items()
+        name: from_dict(kind, values.get(name, {}), f"{where} [{name}]") for name, kind in SECTIONS.items()
     }
     return TrainingConfig(**built)
 

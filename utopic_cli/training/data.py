@@ -1,13 +1,16 @@
-"""Pairs made on the fly: pair number i of a run depends on the run's seed and i alone.
+"""Pairs made on the fly by worker processes, in batches.
 
-Making a pair costs about as much as learning from it, so each is shown ``repeats`` times,
-one block of pairs after the other; a worker keeps the block it has made.
+What batch number i of a run holds depends on the run's seed and i alone, so a run can go on
+where it stopped, and several processes can share it. Making a pair costs about as much as
+learning from it, so each is shown ``repeats`` times, one block of batches after the other; a
+worker keeps the block it has made.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,6 +18,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from utopic_cli.bridge import to_cloud_input
+from utopic_cli.model.cloud_input import stack_clouds
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, prepare
 from utopic_cli.synthesis.pairs import PairSettings, ScanPair, random_pair
@@ -27,6 +31,9 @@ if TYPE_CHECKING:
 
 FAR = 1e3
 """Distance of a scanner at infinity, in extents."""
+
+BLOCK = 32
+"""Batches between a pair and its repetition."""
 
 
 class SampledPair(NamedTuple):
@@ -74,67 +81,131 @@ def to_training_pair(pair: SampledPair, neighbours: int) -> TrainingPair:
     )
 
 
+def stack_pairs(pairs: list[TrainingPair]) -> TrainingPair:
+    """Put batches of pairs into one batch; smaller clouds are filled up."""
+    sources, targets, *answers = zip(*pairs, strict=True)
+    return TrainingPair(
+        stack_clouds(sources), stack_clouds(targets), *(torch.cat(answer) for answer in answers)
+    )
+
+
 def _far_away(cloud: PointCloud, direction: np.ndarray | None, extent: float) -> np.ndarray | None:
     """Return a (3,) scanner position far off in a direction, or None where there is none."""
     return None if direction is None else cloud.points.mean(axis=0) + FAR * extent * direction
 
 
-BLOCK = 64
-"""Pairs between a pair and its repetition."""
+@dataclass(frozen=True)
+class Batch:
+    """Which pairs a batch holds.
 
-Key = tuple[int, int, int]
-"""Number of a pair, and the fewest and most points its clouds are to have."""
+    Attributes:
+        first: number of its first pair; the others follow.
+        count: number of pairs.
+        fewest: the points a cloud is to have at most are drawn from here ...
+        most: ... to here, once for the batch, so that little of it is filling.
+    """
+
+    first: int
+    count: int
+    fewest: int
+    most: int
 
 
 class SynthesisedPairs(Dataset[TrainingPair]):
-    """Training pairs by key, each from its own generator."""
+    """Batches of training pairs, each pair from its own generator."""
 
-    def __init__(self, library: ShapeLibrary, settings: PairSettings, seed: int, neighbours: int) -> None:
+    def __init__(
+        self,
+        library: ShapeLibrary,
+        settings: PairSettings,
+        seed: int,
+        neighbours: int,
+    ) -> None:
         """Draw from a library of shapes."""
         self.library, self.settings, self.seed, self.neighbours = library, settings, seed, neighbours
         # Arrays, not tensors: a tensor sent to another process keeps a file open.
-        self._made: OrderedDict[Key, SampledPair] = OrderedDict()
+        self._made: OrderedDict[Batch, list[SampledPair]] = OrderedDict()
 
-    def __getitem__(self, key: Key) -> TrainingPair:
-        """Make a pair, or return it again if it was made within the last block."""
-        if key not in self._made:
-            number, fewest, most = key
-            rng = np.random.default_rng([self.seed, number])
-            points = int(rng.integers(fewest, most + 1))
-            pair = random_pair(self.library, rng, self.settings)
-            self._made[key] = sample_pair(pair, points, rng)
+    def __getitem__(self, batch: Batch) -> TrainingPair:
+        """Make a batch, or return it again if it was made within the last block."""
+        if batch not in self._made:
+            points = points_of(batch, self.seed)
+            self._made[batch] = [self._pair(batch.first + i, points) for i in range(batch.count)]
             if len(self._made) > BLOCK:
                 self._made.popitem(last=False)
-        return to_training_pair(self._made[key], self.neighbours)
+        return stack_pairs([to_training_pair(pair, self.neighbours) for pair in self._made[batch]])
+
+    def _pair(self, number: int, points: int) -> SampledPair:
+        rng = np.random.default_rng([self.seed, number])
+        return sample_pair(random_pair(self.library, rng, self.settings), points, rng)
 
 
-class PairKeys:
-    """Sampler: the keys of samples ``start`` to ``stop`` of a run."""
+def points_of(batch: Batch, seed: int) -> int:
+    """Draw how many points the clouds of a batch are to have at most."""
+    # The third number keeps this stream apart from those of the pairs.
+    rng = np.random.default_rng([seed, batch.first, 1])
+    return int(rng.integers(batch.fewest, batch.most + 1))
+
+
+class BatchOrder:
+    """Sampler: the batches of steps ``start`` to ``stop`` of a run.
+
+    Step s of a run shows ``size`` pairs; of several processes, each takes its own share of them.
+    """
 
     def __init__(
-        self, start: int, stop: int, repeats: int, points_of: Callable[[int], tuple[int, int]]
+        self,
+        start: int,
+        stop: int,
+        size: int,
+        repeats: int,
+        limits_of: Callable[[int], tuple[int, int]],
+        share: tuple[int, int] = (0, 1),
     ) -> None:
-        """Show each pair ``repeats`` times; ``points_of(number)`` gives (fewest, most)."""
-        self.start, self.stop, self.repeats, self.points_of = start, stop, repeats, points_of
+        """Show each pair ``repeats`` times.
 
-    def __iter__(self) -> Iterator[Key]:
-        """Yield keys; a block of pairs is gone through ``repeats`` times before the next."""
-        for sample in range(self.start, self.stop):
-            number = sample // (BLOCK * self.repeats) * BLOCK + sample % BLOCK
-            # The settings of a pair are those of the sample that shows it first.
-            yield number, *self.points_of(number * self.repeats)
+        Args:
+            start: first step.
+            stop: step after the last.
+            size: pairs a step, of all processes together.
+            repeats: how often each pair is shown.
+            limits_of: (fewest, most) points of a cloud by number of pairs shown before.
+            share: number of this process, and of all; they must divide ``size``.
+        """
+        self.start, self.stop, self.size, self.repeats = start, stop, size, repeats
+        self.limits_of, self.share = limits_of, share
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield batches; a block of them is gone through ``repeats`` times before the next."""
+        rank, processes = self.share
+        mine = self.size // processes
+        for step in range(self.start, self.stop):
+            number = step // (BLOCK * self.repeats) * BLOCK + step % BLOCK
+            # The settings of a batch are those of the step that shows it first.
+            first_shown = number // BLOCK * BLOCK * self.repeats + number % BLOCK
+            yield Batch(number * self.size + rank * mine, mine, *self.limits_of(first_shown * self.size))
 
 
-def pair_loader(pairs: SynthesisedPairs, keys: PairKeys, workers: int) -> DataLoader[TrainingPair]:
-    """Load pairs in order, made by worker processes ahead of need."""
+def batch_loader(
+    pairs: SynthesisedPairs, order: BatchOrder, workers: int, *, pinned: bool = False
+) -> DataLoader[TrainingPair]:
+    """Load batches in order, made by worker processes ahead of need.
+
+    Args:
+        pairs: makes them.
+        order: which, in order.
+        workers: processes; 0 makes them in this one.
+        pinned: page-locked, for a fast way to a GPU.
+    """
     return DataLoader(
         pairs,
         batch_size=None,
-        sampler=keys,  # type: ignore[arg-type]
+        sampler=order,  # type: ignore[arg-type]
         num_workers=workers,
         prefetch_factor=8 if workers else None,
         collate_fn=_as_it_is,
         worker_init_fn=_one_thread,
+        pin_memory=pinned,
     )
 
 

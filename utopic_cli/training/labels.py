@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from utopic_cli.model.cloud_input import CloudInput
+
 POSITIVE_REACH = 1.1
 """Largest distance, in node spacings, at which two nodes show the same piece of surface."""
 
@@ -23,22 +25,26 @@ class Labels(NamedTuple):
     Attributes:
         correspondences: (B, N, M) soft, in [0, 1]; rows and columns sum to about 1 in the
             overlap and to 0 elsewhere.
-        ignored: (B, N, M) bool, pairs of nodes that are neither right nor clearly wrong.
+        ignored: (B, N, M) bool, pairs of nodes that are neither right nor clearly wrong, or that
+            only fill a batch up.
         source_overlap: (B, N) in {0, 1}.
         target_overlap: (B, M) in {0, 1}.
+        source_valid: (B, N) float, 0 for nodes that only fill a batch up.
+        target_valid: (B, M) float.
     """
 
     correspondences: Tensor
     ignored: Tensor
     source_overlap: Tensor
     target_overlap: Tensor
+    source_valid: Tensor
+    target_valid: Tensor
 
 
 def label_pair(
-    source_points: Tensor,
-    target_points: Tensor,
+    source: CloudInput,
+    target: CloudInput,
     gt_T_target_source: Tensor,
-    spacing: Tensor,
     hard_radius: float = 0.0,
 ) -> Labels:
     """Label a batch of sampled pairs.
@@ -48,51 +54,54 @@ def label_pair(
     with Gaussian weights, and the two directions are averaged.
 
     Args:
-        source_points: (B, N, 3).
-        target_points: (B, M, 3).
+        source: clouds of N points.
+        target: clouds of M points.
         gt_T_target_source: (B, 4, 4).
-        spacing: (B,) node spacing.
         hard_radius: if positive, the correspondences are the paper's mutual nearest neighbours
             within this radius instead.
     """
-    moved = source_points @ gt_T_target_source[:, :3, :3].transpose(1, 2) + gt_T_target_source[:, None, :3, 3]
-    distance = torch.cdist(moved, target_points, compute_mode="donot_use_mm_for_euclid_dist")
-    distance = distance / spacing.view(-1, 1, 1)
-    near = distance < POSITIVE_REACH
+    moved = source.points @ gt_T_target_source[:, :3, :3].transpose(1, 2) + gt_T_target_source[:, None, :3, 3]
+    distance = torch.cdist(moved, target.points, compute_mode="donot_use_mm_for_euclid_dist")
+    source_valid, target_valid = _valid(source), _valid(target)
+    filling = ~(source_valid[:, :, None] & target_valid[:, None])
+    distance = distance.masked_fill(filling, torch.inf)
+    valid = (source_valid.float(), target_valid.float())
     if hard_radius > 0:
-        near = distance * spacing.view(-1, 1, 1) < hard_radius
-        return Labels(
-            mutual_nearest(moved, target_points, hard_radius),
-            torch.zeros_like(near),
-            near.any(dim=2).float(),
-            near.any(dim=1).float(),
-        )
+        near = distance < hard_radius
+        overlap = (near.any(dim=2).float(), near.any(dim=1).float())
+        return Labels(mutual_nearest(distance, hard_radius), filling, *overlap, *valid)
+    distance = distance / source.spacing.view(-1, 1, 1)
+    near = distance < POSITIVE_REACH
     weight = torch.exp(-0.5 * (distance / SOFTNESS) ** 2) * near
     forward = _nearest_four(weight)
     backward = _nearest_four(weight.transpose(1, 2)).transpose(1, 2)
     return Labels(
         correspondences=0.5 * (forward + backward),
-        ignored=(distance < IGNORED_REACH) & ~near,
+        ignored=((distance < IGNORED_REACH) & ~near) | filling,
         source_overlap=near.any(dim=2).float(),
         target_overlap=near.any(dim=1).float(),
+        source_valid=valid[0],
+        target_valid=valid[1],
     )
 
 
-def mutual_nearest(moved_source: Tensor, target_points: Tensor, radius: float) -> Tensor:
+def mutual_nearest(distance: Tensor, radius: float) -> Tensor:
     """The paper's hard correspondences: mutual nearest neighbours closer than ``radius``.
 
     Args:
-        moved_source: (B, N, 3) source points under the known transformation.
-        target_points: (B, M, 3).
+        distance: (B, N, M) from source points under the known transformation to target points.
         radius: r, in the points' units.
 
     Returns:
         (B, N, M) float in {0, 1}.
     """
-    distance = torch.cdist(moved_source, target_points, compute_mode="donot_use_mm_for_euclid_dist")
     nearest_target = distance == distance.min(dim=2, keepdim=True).values
     nearest_source = distance == distance.min(dim=1, keepdim=True).values
     return (nearest_target & nearest_source & (distance < radius)).float()
+
+
+def _valid(cloud: CloudInput) -> Tensor:
+    return torch.ones_like(cloud.points[..., 0], dtype=torch.bool) if cloud.valid is None else cloud.valid
 
 
 def _nearest_four(weight: Tensor) -> Tensor:

@@ -1,4 +1,8 @@
-"""The four losses of the paper (Sec. 3.5) and the descriptors' contrastive loss."""
+"""The four losses of the paper (Sec. 3.5) and the descriptors' contrastive loss.
+
+Every loss is a mean over pairs of a mean within the pair, so that it does not matter which
+pairs share a batch, or a process.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +45,14 @@ def registration_loss(scores: Tensor, labels: Labels) -> Tensor:
 
 def overlap_loss(source_logits: Tensor, target_logits: Tensor, labels: Labels) -> Tensor:
     """Binary cross entropy of the overlap scores of both clouds."""
-    return 0.5 * (
-        binary_cross_entropy_with_logits(source_logits, labels.source_overlap)
-        + binary_cross_entropy_with_logits(target_logits, labels.target_overlap)
-    )
+    source = binary_cross_entropy_with_logits(source_logits, labels.source_overlap, reduction="none")
+    target = binary_cross_entropy_with_logits(target_logits, labels.target_overlap, reduction="none")
+    return 0.5 * (_mean(source, labels.source_valid) + _mean(target, labels.target_valid))
 
 
-def uncertainty_loss(distribution: OverlapDistribution, overlap: Tensor, kl_weight: float = 0.1) -> Tensor:
+def uncertainty_loss(
+    distribution: OverlapDistribution, overlap: Tensor, valid: Tensor, kl_weight: float = 0.1
+) -> Tensor:
     """Fit of the sampled overlaps to the known one, and the distance of their Gaussian to N(0, 1).
 
     The first term makes a confident wrong point expensive, the second keeps the variance
@@ -56,24 +61,32 @@ def uncertainty_loss(distribution: OverlapDistribution, overlap: Tensor, kl_weig
     Args:
         distribution: of one cloud, N points and K samples.
         overlap: (B, N) in {0, 1}.
+        valid: (B, N) float, 0 for points that only fill a batch up.
         kl_weight: weight of the Kullback-Leibler term relative to the first.
     """
     samples = distribution.samples.clamp(1e-6, 1.0 - 1e-6)
-    fit = binary_cross_entropy(samples, overlap[:, None].expand_as(samples))
+    fit = binary_cross_entropy(samples, overlap[:, None].expand_as(samples), reduction="none").mean(dim=1)
     mean, log_variance = distribution.mean, distribution.log_variance
-    divergence = 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance).mean()
-    return 0.5 * fit + kl_weight * divergence
+    divergence = 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance)
+    return _mean(0.5 * fit + kl_weight * divergence, valid)
 
 
-def chamfer_loss(predicted: Tensor, expected: Tensor) -> Tensor:
+def chamfer_loss(predicted: Tensor, expected: Tensor, valid: Tensor) -> Tensor:
     """L1 Chamfer distance: mean nearest distance both ways, halved.
 
     Args:
         predicted: (B, P, 3).
         expected: (B, Q, 3).
+        valid: (B, Q) float, 0 for expected points that only fill a batch up.
     """
     distance = torch.cdist(predicted, expected)
-    return 0.5 * (distance.min(dim=2).values.mean() + distance.min(dim=1).values.mean())
+    to_expected = distance.masked_fill(valid[:, None] == 0, torch.inf).min(dim=2).values
+    return 0.5 * (to_expected.mean() + _mean(distance.min(dim=1).values, valid))
+
+
+def _mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Mean over pairs of the weighted mean of (B, N) values; a pair without weight counts as 0."""
+    return ((values * weight).sum(dim=1) / weight.sum(dim=1).clamp_min(1.0)).mean()
 
 
 def _soft_cross_entropy(logits: Tensor, targets: Tensor) -> Tensor:
@@ -81,5 +94,4 @@ def _soft_cross_entropy(logits: Tensor, targets: Tensor) -> Tensor:
     mass = targets.sum(dim=2)
     log_probability = torch.log_softmax(logits, dim=2)
     per_row = -(targets * log_probability).sum(dim=2) / mass.clamp_min(1e-6)
-    has_target = (mass > 1e-6).float()
-    return (per_row * has_target).sum() / has_target.sum().clamp_min(1.0)
+    return _mean(per_row, (mass > 1e-6).float())

@@ -67,14 +67,7 @@ class TrainingNetwork(nn.Module):
 
     def label(self, pair: TrainingPair) -> Labels:
         """Label a batch of pairs."""
-        source, target = pair.source, pair.target
-        return label_pair(
-            source.points,
-            target.points,
-            pair.gt_T_target_source,
-            source.spacing,
-            self.correspondence_radius,
-        )
+        return label_pair(pair.source, pair.target, pair.gt_T_target_source, self.correspondence_radius)
 
     def descriptor_stage(self, pair: TrainingPair) -> dict[str, Tensor]:
         """First stage: the extractor alone, by its descriptors. Returns loss terms."""
@@ -105,19 +98,24 @@ class TrainingNetwork(nn.Module):
             "overlap": overlap_loss(
                 prediction.source_overlap_logits, prediction.target_overlap_logits, labels
             ),
-            "uncertainty": uncertainty_loss(prediction.source_distribution, labels.source_overlap)
-            + uncertainty_loss(prediction.target_distribution, labels.target_overlap),
+            "uncertainty": uncertainty_loss(
+                prediction.source_distribution, labels.source_overlap, labels.source_valid
+            )
+            + uncertainty_loss(prediction.target_distribution, labels.target_overlap, labels.target_valid),
         }
         if completion:
-            terms["completion"] = self._completion_loss(pair, prediction.source_features, forward=True)
-            terms["completion"] = terms["completion"] + self._completion_loss(
-                pair, prediction.target_features, forward=False
-            )
+            terms["completion"] = self._completion_loss(
+                pair, labels, prediction.source_features, forward=True
+            ) + self._completion_loss(pair, labels, prediction.target_features, forward=False)
         return terms
 
-    def _completion_loss(self, pair: TrainingPair, features: Tensor, *, forward: bool) -> Tensor:
+    def _completion_loss(
+        self, pair: TrainingPair, labels: Labels, features: Tensor, *, forward: bool
+    ) -> Tensor:
         """Chamfer loss of one cloud's completion against the union of both scans in its frame."""
         own, other = (pair.source, pair.target) if forward else (pair.target, pair.source)
+        valid = (labels.source_valid, labels.target_valid)
+        own_valid, other_valid = valid if forward else valid[::-1]
         rotation = pair.gt_T_target_source[:, :3, :3]
         translation = pair.gt_T_target_source[:, None, :3, 3]
         if forward:
@@ -126,10 +124,11 @@ class TrainingNetwork(nn.Module):
             moved = other.points @ rotation.transpose(1, 2) + translation
         whole = torch.cat([own.points, moved], dim=1)
         if self.in_canonical_frame:
-            centre, axes = canonical_frame(own.points)
+            centre, axes = canonical_frame(own.points, own_valid)
             whole = (whole - centre) @ axes
-        coarse, fine = self.completion(features)
-        return chamfer_loss(coarse.float(), whole) + chamfer_loss(fine.float(), whole)
+        coarse, fine = self.completion(features, own.valid)
+        both = torch.cat([own_valid, other_valid], dim=1)
+        return chamfer_loss(coarse.float(), whole, both) + chamfer_loss(fine.float(), whole, both)
 
 
 def total_loss(terms: dict[str, Tensor], weights: LossWeights) -> Tensor:

@@ -13,8 +13,16 @@ from utopic_cli.training.network import TrainingPair
 
 
 @torch.no_grad()
-def validate(model: Utopic, pairs: Sequence[TrainingPair], seed: int) -> dict[str, float]:
+def validate(
+    model: Utopic, pairs: Sequence[TrainingPair], seed: int, *, descriptors_only: bool = False
+) -> dict[str, float]:
     """Measure a network on held-out pairs.
+
+    Args:
+        model: the network.
+        pairs: batches of one.
+        seed: seed of the overlap samples.
+        descriptors_only: only the hit rate, for which the extractor alone is run.
 
     Returns:
         ``hit_rate``: share of overlapping source points whose most similar target descriptor
@@ -25,13 +33,16 @@ def validate(model: Utopic, pairs: Sequence[TrainingPair], seed: int) -> dict[st
     """
     model.eval()
     names = ("hit_rate", "match_rate", "inlier_ratio", "overlap_accuracy", "known_overlap_accuracy")
-    sums = dict.fromkeys(names, 0.0)
+    sums = dict.fromkeys(names[:1] if descriptors_only else names, 0.0)
     for number, pair in enumerate(pairs):
+        if descriptors_only:
+            similarity = model.extractor(pair.source)[1] @ model.extractor(pair.target)[1].transpose(1, 2)
+            overlapping = label_pair(pair.source, pair.target, pair.gt_T_target_source).source_overlap[0]
+            sums["hit_rate"] += _share_within(similarity[0], _match_errors(pair), overlapping > 0.5)
+            continue
         generator = torch.Generator().manual_seed(seed + number)
         prediction = model(pair.source, pair.target, generator=generator)
-        labels = label_pair(
-            pair.source.points, pair.target.points, pair.gt_T_target_source, pair.source.spacing
-        )
+        labels = label_pair(pair.source, pair.target, pair.gt_T_target_source)
         error = _match_errors(pair)
         overlapping = labels.source_overlap[0] > 0.5
         scores = prediction.matching_scores[0, :-1, :-1]
