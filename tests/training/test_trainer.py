@@ -110,7 +110,7 @@ def test_the_journal_starts_with_the_untrained_network(shapes, tmp_path):
 
 def test_weights_of_another_architecture_are_refused(shapes, tmp_path):
     other = TrainingNetwork(ModelConfig(**{**SMALL, "feature_width": 24})).inference.state_dict()
-    with pytest.raises(InputError, match="another architecture: .*: .*, now "):
+    with pytest.raises(InputError, match=r"another architecture: .*: .*, now "):
         run(shapes, tmp_path, start_from=other)
 
 
@@ -259,3 +259,13 @@ def test_the_papers_rate_falls_in_steps():
     schedule = Schedule(descriptor_pairs=0, joint_pairs=1000, rate_steps=(0.6, 0.7), joint_rate=1e-3)
     rates = [learning_rate(schedule, pairs) for pairs in (300, 599, 600, 699, 700, 999)]
     assert rates == pytest.approx([1e-3, 1e-3, 2e-4, 2e-4, 4e-5, 4e-5])
+
+
+def test_pairs_made_on_the_device_train_resume_and_repeat(shapes, tmp_path):
+    run(shapes, tmp_path / "whole", synthesis="device")
+    run(shapes, tmp_path / "parts", synthesis="device", minutes=0.0)
+    run(shapes, tmp_path / "parts", synthesis="device", resume=True)
+    whole, parts = (read_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
+    assert whole["pairs"] == 8
+    for name, value in whole["model"].items():
+        assert torch.equal(value, parts["model"][name]), name

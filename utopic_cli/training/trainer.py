@@ -6,7 +6,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +21,7 @@ from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import pack_weights
 from utopic_cli.synthesis.pairs import random_pair
 from utopic_cli.synthesis.shapes import ShapeLibrary
+from utopic_cli.training.batched import BatchedPairs, batches_on_device
 from utopic_cli.training.checkpoint import describe_difference, read_checkpoint, write_checkpoint
 from utopic_cli.training.config import Schedule, TrainingConfig, training_config_from
 from utopic_cli.training.data import BatchOrder, SynthesisedPairs, batch_loader, sample_pair, to_training_pair
@@ -52,6 +53,7 @@ def train(
     minutes: float | None = None,
     device: torch.device | None = None,
     workers: int = 1,
+    synthesis: str = "auto",
     start_from: dict[str, torch.Tensor] | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -69,6 +71,8 @@ def train(
         minutes: stop, with a checkpoint and an export, after this long.
         device: where to train; the CPU if None.
         workers: processes that make pairs, for each process that trains.
+        synthesis: where pairs are made: by the ``workers``, each shown ``repeats`` times; in batches on
+            the training ``device``, all new; ``auto``: on a GPU if that is what trains.
         start_from: weights of the inference network to start from.
         progress: called with every record of the journal.
 
@@ -90,9 +94,10 @@ def train(
             )
         out.mkdir(parents=True, exist_ok=True)
         run = _start(config, device, out, resume, start_from)
-        shapes = (training_shapes, validation_shapes)
         limits = _Limits(minutes, lambda: bool(received))
-        measured = _loop(run, shapes, processes, workers, limits, progress)
+        on_device = synthesis == "device" or (synthesis == "auto" and device.type == "cuda")
+        batches = _batches(run, training_shapes, processes, None if on_device else workers)
+        measured = _loop(run, batches, validation_shapes, processes, limits, progress)
         path = out / "utopic.safetensors"
         if processes.leads:
             card = {
@@ -201,11 +206,38 @@ def _start(
     return run
 
 
+def _batches(
+    run: _Run, shapes: ShapeLibrary, processes: Processes, workers: int | None
+) -> Iterable[TrainingPair]:
+    """What is left of the run, as this process' share of each batch.
+
+    Args:
+        run: how far it is.
+        shapes: to make pairs of.
+        processes: among which batches are shared.
+        workers: processes that make pairs; None makes them on the training device.
+    """
+    schedule, k = run.config.schedule, run.config.model.neighbours
+    order = BatchOrder(
+        run.done // schedule.batch,
+        total_pairs(schedule) // schedule.batch,
+        schedule.batch,
+        1 if workers is None else schedule.repeats,
+        lambda pairs: _limits_of(pairs, schedule),
+        (processes.rank, processes.count),
+    )
+    if workers is None:
+        pairs = BatchedPairs(shapes, run.config.pairs, device=run.device, neighbours=k)
+        return batches_on_device(pairs, order, schedule.seed)
+    made = SynthesisedPairs(shapes, run.config.pairs, schedule.seed, k)
+    return batch_loader(made, order, workers, pinned=run.device.type == "cuda")
+
+
 def _loop(
     run: _Run,
-    shapes: tuple[ShapeLibrary, ShapeLibrary],
+    batches: Iterable[TrainingPair],
+    validation_shapes: ShapeLibrary,
     processes: Processes,
-    workers: int,
     limits: _Limits,
     progress: Progress | None,
 ) -> dict[str, float]:
@@ -214,18 +246,7 @@ def _loop(
     weights = run.config.loss.weights()
     # On CPUs without matrix units bfloat16 costs half as much again, so only GPUs get it.
     reduced = schedule.bfloat16 and device.type == "cuda"
-    steps = total_pairs(schedule) // schedule.batch
-    share = (processes.rank, processes.count)
-    order = BatchOrder(
-        run.done // schedule.batch,
-        steps,
-        schedule.batch,
-        schedule.repeats,
-        lambda pairs: _limits_of(pairs, schedule),
-        share,
-    )
-    made = SynthesisedPairs(shapes[0], run.config.pairs, schedule.seed, run.config.model.neighbours)
-    held_out = _validation_pairs(shapes[1], run.config) if processes.leads else []
+    held_out = _validation_pairs(validation_shapes, run.config) if processes.leads else []
     measured: dict[str, float] = {}
     meter = _Meter()
     begun, elapsed_before = time.monotonic(), run.elapsed
@@ -243,7 +264,7 @@ def _loop(
             begun = time.monotonic()
             meter = _Meter()
         asked = time.monotonic()
-        for batch in batch_loader(made, order, workers, pinned=device.type == "cuda"):
+        for batch in batches:
             meter.waited += time.monotonic() - asked
             network.train()
             joint = run.done >= schedule.descriptor_pairs
@@ -264,7 +285,7 @@ def _loop(
             run.average.update(network.inference, run.done // schedule.batch)
             run.elapsed = elapsed_before + time.monotonic() - begun
             meter.add(terms, schedule.batch)
-            finished = run.done >= steps * schedule.batch
+            finished = run.done >= total_pairs(schedule)
             stop = processes.any_of(limits.seconds_left() < validation.seconds or limits.asked(), device)
             last = finished or stop
             if journal is not None and (last or meter.seconds() > RECORD_SECONDS):
