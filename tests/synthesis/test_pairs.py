@@ -12,6 +12,7 @@ from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.synthesis.pairs import (
     DegeneratePair,
     PairSettings,
+    evaluation_pair,
     evaluation_pairs,
     patch_pair,
     random_pair,
@@ -188,6 +189,81 @@ def test_hidden_surfaces_are_not_sampled():
     pair = surface_pair(mesh, np.random.default_rng(2), "shared", 1.0, noise=0.0)
     centred = pair.source.points - (pair.source.points.max(axis=0) + pair.source.points.min(axis=0)) / 2
     assert (np.linalg.norm(centred, axis=1) < 0.25).mean() < 0.003  # 8 % of the mesh's area
+
+
+@pytest.mark.parametrize("sampling", ["shared", "independent"])
+def test_the_whole_object_travels_along_without_changing_the_pair(library, sampling):
+    without, pair = (
+        surface_pair(library.mesh(0), np.random.default_rng(4), sampling, noise=0.0, whole=whole)
+        for whole in (False, True)
+    )
+    assert without.object_points is None
+    np.testing.assert_array_equal(without.source.points, pair.source.points)
+    np.testing.assert_array_equal(without.target.points, pair.target.points)
+    # The source is part of it as it lies, the target once the object is moved as the source is.
+    assert cKDTree(pair.object_points).query(pair.source.points)[0].max() < 1e-9
+    moved = rigid.apply(pair.gt_T_target_source, pair.object_points)
+    assert cKDTree(moved).query(pair.target.points)[0].max() < 1e-9
+
+
+@pytest.mark.parametrize("make", [range_scan_pair, patch_pair])
+def test_scans_and_patches_lie_on_the_whole_object(library, make):
+    settings = replace(CLEAN, minimum_overlap=0.0, keep_above=1.0)
+    without, pair = (
+        make(library.mesh(1), np.random.default_rng(5), settings, whole=whole) for whole in (False, True)
+    )
+    assert without.object_points is None
+    np.testing.assert_array_equal(without.source.points, pair.source.points)
+    assert 15_000 <= len(pair.object_points) <= 40_000
+    tree = cKDTree(pair.object_points)
+    for points in (
+        pair.source.points,
+        rigid.apply(rigid.invert(pair.gt_T_target_source), pair.target.points),
+    ):
+        assert np.quantile(tree.query(points)[0], 0.99) < 0.02 * pair.extent
+    # And it is whole: much of it neither scan shows.
+    seen = cKDTree(pair.source.points).query(pair.object_points)[0] < 0.02 * pair.extent
+    assert seen.mean() < 0.8
+
+
+def test_points_that_are_given_are_the_ones_used(library):
+    mesh = library.mesh(0)
+    given = 0.9 * sample_surface(*mesh, 2048, np.random.default_rng(0))[0]
+    for sampling in ("shared", "independent"):
+        with_whole, pair = (
+            surface_pair(
+                (0.9 * mesh[0], mesh[1]), np.random.default_rng(7), sampling, noise=0.0, rotations="euler45",
+                sample=given, whole=whole,
+            )
+            for whole in (True, False)
+        )  # fmt: skip
+        np.testing.assert_array_equal(pair.source.points, with_whole.source.points)
+        assert len(pair.source) == 717
+        # The target stays in the object's frame: its points are the given ones, neither moved nor scaled.
+        assert cKDTree(given).query(pair.target.points)[0].max() < 1e-6
+        moved = rigid.apply(pair.gt_T_target_source, with_whole.object_points)
+        assert cKDTree(moved).query(given)[0].max() < 0.1
+    assert pair.object_points is None
+    with pytest.raises(DegeneratePair, match="only 2000"):
+        surface_pair(mesh, np.random.default_rng(7), sample=given[:2000])
+
+
+def test_shared_points_are_known_by_their_numbers(library):
+    pair = surface_pair(library.mesh(0), np.random.default_rng(6), "shared", 0.7, noise=0.0)
+    source, target = pair.source.points[pair.shared[:, 0]], pair.target.points[pair.shared[:, 1]]
+    np.testing.assert_allclose(rigid.apply(pair.gt_T_target_source, source), target, atol=1e-9)
+    distance = cKDTree(pair.target.points).query(rigid.apply(pair.gt_T_target_source, pair.source.points))[0]
+    assert len(pair.shared) == (distance < 1e-9).sum()  # all of them
+    assert surface_pair(library.mesh(0), np.random.default_rng(6), "independent").shared is None
+
+
+def test_one_evaluation_pair_is_made_without_those_before_it(library):
+    settings = replace(PairSettings(), points=(4000, 6000))
+    bands = ((0.1, 0.5), (0.5, 0.9))
+    pairs = list(evaluation_pairs(library, 3, 2, bands, settings))
+    alone = evaluation_pair(library, 3, 1, bands, settings, whole=True)
+    np.testing.assert_array_equal(alone.source.points, pairs[1].source.points)
+    assert alone.shape in library.names and alone.object_points is not None
 
 
 def test_patches_are_parts_of_a_whole_surface(library):

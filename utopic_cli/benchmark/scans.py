@@ -22,17 +22,13 @@ and ``report.to_json()`` is the text of the JSON file.
 from __future__ import annotations
 
 import os
-import platform
 import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from utopic_cli import __version__
 from utopic_cli.benchmark.baselines import find_baselines
 from utopic_cli.benchmark.ground_truth import KnownPair, measured_overlap, read_ground_truth
 from utopic_cli.benchmark.method import Method, Trial, Utopic, UtopicCommand
@@ -43,6 +39,7 @@ from utopic_cli.benchmark.metrics import (
     pose_error,
 )
 from utopic_cli.benchmark.scans_report import SCHEMA_VERSION, Attempt, Report, render
+from utopic_cli.benchmark.versions import versions
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.geometry.rigid import invert, nearest_rotation, random_rotation, rigid
@@ -127,7 +124,7 @@ def run_methods(
         "success": {"rre_deg_below": MAX_RRE_DEG, "rte_share_of_extent_below": MAX_RTE_SHARE},
         "extent": "diagonal of the bounding box of the larger scan, as in its file",
         "methods": {method.name: method.settings() for method in methods},
-        "versions": _versions(),
+        "versions": versions(),
     }
     read = lru_cache(maxsize=8)(read_scan)
     chosen = _choose(read_ground_truth(directory), read, pairs, min_overlap)
@@ -241,16 +238,3 @@ def _refined(trial: Trial, estimate: np.ndarray) -> np.ndarray:
 
     exact = rigid(nearest_rotation(estimate[:3, :3]), estimate[:3, 3])
     return refine(trial.source, trial.target, exact).T_target_source
-
-
-def _versions() -> dict[str, Any]:
-    found: dict[str, Any] = {"utopic_cli": __version__, "python": platform.python_version()}
-    for package in ("numpy", "scipy", "torch", "open3d"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    found["platform"] = f"{platform.system()} {platform.machine()}"
-    found["cpu_count"] = os.cpu_count()
-    found["omp_num_threads"] = os.environ.get("OMP_NUM_THREADS")
-    return found

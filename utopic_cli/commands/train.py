@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -46,6 +46,10 @@ def train(
         ),
     ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes that make pairs.")] = 1,
+    synthesis: Annotated[
+        Literal["auto", "workers", "device"],
+        typer.Option(help="Where pairs are made: by worker processes, or in batches on the training device."),
+    ] = "auto",
     device: Device = "auto",
     quiet: Quiet = False,
     debug: Debug = False,
@@ -84,6 +88,7 @@ def train(
             minutes=minutes,
             device=place,
             workers=workers,
+            synthesis=synthesis,
             start_from=first,
             progress=view.show,
         )

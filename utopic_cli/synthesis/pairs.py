@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ __all__ = [
     "DegeneratePair",
     "PairSettings",
     "ScanPair",
+    "evaluation_pair",
     "evaluation_pairs",
     "patch_pair",
     "random_pair",
@@ -84,24 +86,43 @@ def evaluation_pairs(
     Raises:
         DegeneratePair: a band was not met in four times ``settings.attempts`` draws.
     """
-    settings = settings or PairSettings()
     for number in range(count):
-        rng = np.random.default_rng([seed, number])
-        yield _pair_in_band(library, rng, settings, bands[number % len(bands)])
+        yield evaluation_pair(library, seed, number, bands, settings)
 
 
-def _pair_in_band(
-    library: ShapeLibrary, rng: np.random.Generator, settings: PairSettings, band: Range
+def evaluation_pair(
+    library: ShapeLibrary,
+    seed: int,
+    number: int,
+    bands: Sequence[Range] = EVALUATION_BANDS,
+    settings: PairSettings | None = None,
+    *,
+    whole: bool = False,
 ) -> ScanPair:
-    low, high = band
+    """Make pair ``number`` of the test set of ``evaluation_pairs`` alone.
+
+    Args:
+        library: see there, as for ``seed``, ``bands`` and ``settings``.
+        seed: names the test set.
+        number: of the pair, from 0.
+        bands: the band is the ``number``-th, round and round.
+        settings: the training mixture's if None.
+        whole: let a sample of the whole object travel with the pair.
+
+    Raises:
+        DegeneratePair: the band was not met in four times ``settings.attempts`` draws.
+    """
+    settings = settings or PairSettings()
+    rng = np.random.default_rng([seed, number])
+    low, high = bands[number % len(bands)]
     for _ in range(4 * settings.attempts):
-        mesh = library.mesh(library.draw(rng))
+        shape = library.draw(rng)
         try:
-            pair = range_scan_pair(mesh, rng, settings, band)
+            pair = range_scan_pair(library.mesh(shape), rng, settings, (low, high), whole=whole)
         except DegenerateShape:
             continue
         if low <= pair.smaller_overlap < high:
-            return pair
+            return replace(pair, shape=str(library.names[shape]))
     raise DegeneratePair(f"no pair with an overlap of {low:g} to {high:g} in {4 * settings.attempts} draws")
 
 
@@ -116,6 +137,7 @@ def _sparse_pair(
         count=int(np.exp(rng.uniform(*np.log(settings.surface_points)))),
         noise=rng.uniform(*settings.surface_noise),
         clip=settings.surface_clip,
+        rotations=settings.surface_rotations,
     )
     if pair.smaller_overlap < settings.minimum_overlap:
         raise DegeneratePair(f"overlap {pair.smaller_overlap:.2f} is under {settings.minimum_overlap:g}")

@@ -104,6 +104,8 @@ def range_scan_pair(
     rng: np.random.Generator,
     settings: PairSettings | None = None,
     band: Range | None = None,
+    *,
+    whole: bool = False,
 ) -> ScanPair:
     """Scan one object from two sides and move the scans apart.
 
@@ -115,6 +117,7 @@ def range_scan_pair(
         settings: probabilities and ranges; the training mixture's if None.
         band: overlap of the smaller side to aim at; drawn from ``settings.bands`` if None.
             The result can miss it: an object need not have such a pair of views.
+        whole: let a sample of the whole object travel with the pair.
 
     Raises:
         DegeneratePair: too few visible points, overlap under the minimum, or drawn above
@@ -147,6 +150,7 @@ def range_scan_pair(
         rng,
         translation=settings.translation,
         viewpoints=(viewpoints[0], viewpoints[1]),
+        whole=surface.points if whole else None,
     )
     overlap = pair.smaller_overlap
     if overlap < settings.minimum_overlap:
@@ -201,6 +205,8 @@ def _scan(
     ramp = _unit(rng.standard_normal(3)) if rng.random() < settings.ramp_probability else None
     limit = rng.uniform(*settings.grazing_cosine)
     sigma = settings.noise[0] + (settings.noise[1] - settings.noise[0]) * rng.random() ** 2
+    if settings.rough_probability > 0 and rng.random() < settings.rough_probability:
+        sigma = rng.uniform(*settings.rough_noise)
     parts = []
     for direction in views:
         view = depth_map(surface.points, direction, surface.cell)
@@ -216,9 +222,9 @@ def _scan(
     points = np.concatenate(parts)
     if rng.random() < settings.hole_probability:
         points = _with_holes(points, surface.extent, rng, settings)
+    check_cloud(points, LEAST_POINTS, surface.extent)
     if rng.random() < settings.outlier_probability:
         points = _with_outliers(points, views[0], surface.extent, rng, settings)
-    check_cloud(points, LEAST_POINTS, surface.extent)
     return points.take(rng.permutation(len(points)), axis=0)
 
 

@@ -13,6 +13,7 @@ from utopic_cli.synthesis.surface import DegenerateShape
 
 OVERLAP_RADIUS = 0.01  # in extents of the object; wider where the clouds are sparser than that
 MEASURED_POINTS, COMPARED_POINTS = 1500, 6000
+OBJECT_POINTS = 40_000  # at least half as many; dense enough to tell surfaces 1 % of the extent apart
 
 
 class DegeneratePair(DegenerateShape):
@@ -34,6 +35,10 @@ class ScanPair:
         target_viewpoint: (3,) the same of the target, in the target's frame.
         kind: range_scan, independent, shared or patch.
         extent: diagonal of the bounding box of the whole object, in the points' unit.
+        object_points: (P, 3) sample of the whole object in the source's frame, where it was asked for.
+        shared: (K, 2) int64, row (i, j) where source point i and target point j are one point of
+            the object but for noise; None unless both clouds are crops of one sample.
+        shape: name of the shape, where it is known.
     """
 
     source: PointCloud
@@ -44,6 +49,9 @@ class ScanPair:
     target_viewpoint: np.ndarray | None
     kind: str
     extent: float
+    object_points: np.ndarray | None = None
+    shared: np.ndarray | None = None
+    shape: str | None = None
 
     @property
     def smaller_overlap(self) -> float:
@@ -61,6 +69,7 @@ def posed_pair(
     translation: float,
     viewpoints: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
     motions: tuple[np.ndarray, np.ndarray] | None = None,
+    whole: np.ndarray | None = None,
 ) -> ScanPair:
     """Move two clouds of one object into frames of their own and measure their overlap.
 
@@ -73,6 +82,7 @@ def posed_pair(
         translation: largest translation along an axis, in extents.
         viewpoints: directions towards the scanners in the object's frame.
         motions: (4, 4) motions of source and target to use instead of random ones.
+        whole: (P, 3) sample of the whole object to travel with the pair, thinned evenly.
     """
     if motions is None:
         first, second = (random_motion(rng, translation * extent) for _ in range(2))
@@ -92,6 +102,7 @@ def posed_pair(
         seen_from[1],
         kind,
         extent,
+        None if whole is None else rigid.apply(first, _thinned(whole)),
     )
 
 
@@ -140,6 +151,11 @@ def check_cloud(points: np.ndarray, least: int, extent: float) -> None:
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points[:: max(1, len(points) // 2000)].T)), 0.0))
     if spread[1] < 0.01 * extent:
         raise DegeneratePair("the points lie along a line")
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """Take every n-th point, so that no random draw is spent on it."""
+    return points[:: -(-len(points) // OBJECT_POINTS)].astype(np.float64)
 
 
 def _few(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from utopic_cli.geometry.rigid import invert, rigid
@@ -26,6 +28,8 @@ def surface_pair(
     noise: float = 0.01,
     clip: float = 0.05,
     rotations: str = "uniform",
+    sample: np.ndarray | None = None,
+    whole: bool = False,
 ) -> ScanPair:
     """Make a pair by the paper's protocol (Sec. 4.1): sample, crop by half-spaces, jitter, move.
 
@@ -44,6 +48,12 @@ def surface_pair(
         clip: the jitter is cut off at this.
         rotations: ``uniform`` over SO(3) for both clouds, or ``euler45`` (the paper's: each
             Euler angle uniform in 0 to 45 degrees, translation uniform within 0.5).
+        sample: (S, 3) points to draw from instead of the mesh's surface, in the mesh's frame and
+            already of the scale wanted (a data set that gives points).
+        whole: let a sample of the whole object travel with the pair.
+
+    Returns:
+        The pair; with ``shared`` sampling it says which points are the same.
 
     Raises:
         ValueError: unknown ``sampling`` or ``rotations``.
@@ -53,32 +63,51 @@ def surface_pair(
         raise ValueError(f"sampling is {sampling!r}; expected 'shared' or 'independent'")
     if rotations not in ("uniform", "euler45"):
         raise ValueError(f"rotations is {rotations!r}; expected 'uniform' or 'euler45'")
-    points = outer_points(*sample_surface(normalised(mesh[0]), mesh[1], OUTSIDE_SAMPLES, rng))
-    points = normalised(points[rng.permutation(len(points))].astype(np.float64))
+    if sample is None:
+        points = outer_points(*sample_surface(normalised(mesh[0]), mesh[1], OUTSIDE_SAMPLES, rng))
+        points = dense = normalised(points[rng.permutation(len(points))].astype(np.float64))
+    else:
+        points = sample[rng.permutation(len(sample))].astype(np.float64)
+        dense = sample_surface(*mesh, OUTSIDE_SAMPLES, rng.spawn(1)[0])[0] if whole else points
     if len(points) < 2 * count:
         raise DegeneratePair(f"only {len(points)} points of the surface can be seen from outside")
     first = points[:count]
     second = first if sampling == "shared" else points[count : 2 * count]
-    clouds = []
+    clouds, indices = [], []
     for cloud in (first, second):
         direction = rng.standard_normal(3)
-        kept = cloud[rng.permutation(half_space_crop(cloud, direction, keep))]
-        clouds.append(kept + jitter(kept.shape, noise, clip, rng))
+        index = rng.permutation(half_space_crop(cloud, direction, keep))
+        clouds.append(cloud[index] + jitter((len(index), 3), noise, clip, rng))
+        indices.append(index)
     motions = None
     if rotations == "euler45":
         motions = (invert(_paper_motion(rng)), np.eye(4))
-    return posed_pair(
-        clouds[0], clouds[1], sampling, bounding_diagonal(points), rng, translation=0.5, motions=motions
+    pair = posed_pair(
+        clouds[0],
+        clouds[1],
+        sampling,
+        bounding_diagonal(points),
+        rng,
+        translation=0.5,
+        motions=motions,
+        whole=dense if whole else None,
     )
+    if sampling == "independent":
+        return pair
+    _, *places = np.intersect1d(indices[0], indices[1], assume_unique=True, return_indices=True)
+    return replace(pair, shared=np.stack(places, axis=1))
 
 
-def patch_pair(mesh: Mesh, rng: np.random.Generator, settings: PairSettings | None = None) -> ScanPair:
+def patch_pair(
+    mesh: Mesh, rng: np.random.Generator, settings: PairSettings | None = None, *, whole: bool = False
+) -> ScanPair:
     """Cut two overlapping dense patches out of a whole (stretched, warped) surface.
 
     Args:
         mesh: vertices (V, 3) and faces (F, 3).
         rng: source of randomness.
         settings: the ``patch_*`` ranges, stretch, warp and noise.
+        whole: let a sample of the whole object travel with the pair.
 
     Raises:
         DegeneratePair: the patches overlap too little, or have too few points.
@@ -100,7 +129,15 @@ def patch_pair(mesh: Mesh, rng: np.random.Generator, settings: PairSettings | No
         kept = kept + jitter(kept.shape, sigma / np.sqrt(3.0), 3.0 * sigma, rng)
         check_cloud(kept, 500, surface.extent)
         clouds.append(kept)
-    pair = posed_pair(clouds[0], clouds[1], "patch", surface.extent, rng, translation=settings.translation)
+    pair = posed_pair(
+        clouds[0],
+        clouds[1],
+        "patch",
+        surface.extent,
+        rng,
+        translation=settings.translation,
+        whole=outer if whole else None,
+    )
     if pair.smaller_overlap < settings.minimum_overlap:
         raise DegeneratePair(f"overlap {pair.smaller_overlap:.2f} is under {settings.minimum_overlap:g}")
     return pair

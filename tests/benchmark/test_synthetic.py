@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from utopic_cli.benchmark import synthetic
+from utopic_cli.benchmark.answers import FLOOR, REFINED, SOLVED, answer_pair
+from utopic_cli.benchmark.fpfh import Fpfh
+from utopic_cli.benchmark.protocols import CropProtocol, RangeProtocol
+from utopic_cli.benchmark.synthetic import Report, held_out, render, run
+from utopic_cli.bridge import NetworkView
+from utopic_cli.errors import InputError, UsageError
+from utopic_cli.geometry.rigid import apply
+from utopic_cli.preprocess import prepare
+from utopic_cli.synthesis.procedural import procedural_mesh
+from utopic_cli.synthesis.settings import PairSettings
+from utopic_cli.synthesis.shapes import ShapeLibrary, pack
+from utopic_cli.synthesis.surface_pairs import surface_pair
+
+SHARED = CropProtocol("modelnet", 0.7, "shared", "euler45")
+SCANS = RangeProtocol(bands=((0.5, 0.9),), pairs=replace(PairSettings(), points=(2000, 3000)))
+
+
+@pytest.fixture(scope="module")
+def shapes() -> ShapeLibrary:
+    rng = np.random.default_rng(3)
+    meshes = [procedural_mesh(rng, 32) for _ in range(3)]
+    return pack(meshes, list("abc"), ["train", "val", "val"], ["one"] * 3)
+
+
+class Oracle:
+    """Knows the matches, and changes its mind about overlap once it is shown a transformation."""
+
+    name, tells_overlap, looks_again = "oracle", True, True
+
+    def __init__(self, gt: np.ndarray) -> None:
+        self.gt = gt
+
+    def settings(self) -> dict[str, str]:
+        return {}
+
+    def look(self, prepared, hypothesis=None) -> NetworkView:
+        moved = apply(prepared.normalise(self.gt), prepared.source.points)
+        distance = np.linalg.norm(moved[:, None] - prepared.target.points[None], axis=2)
+        scores = np.exp(-0.5 * (distance / (0.3 * prepared.spacing)) ** 2)
+        n, m = scores.shape
+        said = 0.0 if hypothesis is None else 1.0
+        return NetworkView(
+            scores, np.full(n, said), np.full(m, said), np.zeros(n), np.zeros(m), np.zeros(n), np.zeros(m)
+        )
+
+
+def test_an_oracle_is_measured_as_one(shapes: ShapeLibrary) -> None:
+    pair = SCANS.pair(shapes, 0, 0)
+    oracle = Oracle(pair.gt_T_target_source)
+    solved, refined = answer_pair(pair, 0, SCANS, [oracle], 400)
+    assert (solved.stage, refined.stage, solved.group) == (SOLVED, REFINED, "0.5-0.9")
+    for answer in (solved, refined):
+        assert answer.pose is not None and answer.pose.within((5.0, 0.05)) and answer.pose.symmetric
+        assert answer.matches is not None and answer.matches.hit_rate == 1.0
+        first, final = answer.first_overlap, answer.final_overlap
+        assert first is not None and final is not None
+        assert (first.recall, final.recall) == (0.0, 1.0)
+        assert first.accuracy == pytest.approx(1.0 - final.accuracy)
+    assert solved.cpu_seconds.keys() == {"look", "solve", "look_again"}
+    assert refined.cpu_seconds.keys() == {"look", "solve", "refine", "look_again"}
+
+
+def test_the_floor_of_a_pair_without_noise_is_zero(shapes: ShapeLibrary) -> None:
+    clean = surface_pair(shapes.mesh(1), np.random.default_rng(0), "shared", 0.7, noise=0.0, whole=True)
+    (floor,) = answer_pair(clean, 0, SHARED, [], 1024)
+    assert floor.stage == FLOOR and floor.pose is not None
+    assert floor.pose.rotation_deg < 1e-5 and floor.pose.translation < 1e-9
+    noisy = SHARED.pair(shapes, 0, 0)
+    (floor,) = answer_pair(noisy, 0, SHARED, [], 1024)
+    assert floor.pose is not None and 0.01 < floor.pose.rotation_deg < 1.0
+
+
+def test_scores_that_lead_nowhere_are_a_counted_failure(shapes: ShapeLibrary) -> None:
+    class Blind(Oracle):
+        name, tells_overlap, looks_again = "blind", False, False
+
+        def look(self, prepared, hypothesis=None) -> NetworkView:
+            view = super().look(prepared)
+            return replace(view, matching_scores=np.zeros_like(view.matching_scores))
+
+    pair = SHARED.pair(shapes, 0, 0)
+    floor, solved, refined = answer_pair(pair, 0, SHARED, [Blind(pair.gt_T_target_source)], 1024)
+    for answer in (solved, refined):
+        assert answer.pose is None and answer.message
+    report = Report(settings_of(SHARED), SHARED.groups, (floor, solved, refined))
+    summary = report.summaries()["keep 0.7", "blind", SOLVED]
+    assert (summary.without_answer, summary.success.count) == (1, 0)
+    assert "blind: no answer 2 times" in printed(report)
+    json.loads(report.to_json())
+
+
+def settings_of(protocol: CropProtocol | RangeProtocol) -> dict[str, object]:
+    return {
+        "protocol": protocol.settings(),
+        "data": "some [shapes]",
+        "split": "val",
+        "shapes": 2,
+        "pairs": 1,
+        "seed": 0,
+    }
+
+
+def printed(report: Report) -> str:
+    text = io.StringIO()
+    render(report, Console(file=text, width=170))
+    return text.getvalue()
+
+
+def without_times(report: Report) -> list[dict[str, object]]:
+    return [{**answer.to_dict(), "cpu_seconds": None} for answer in report.answers]
+
+
+OPTIONS = {"pairs": 2, "seed": 1, "points": 200, "device": "cpu", "workers": 2}
+
+
+def test_a_tiny_run_gives_the_same_for_any_number_of_workers(shapes: ShapeLibrary) -> None:
+    seen: list[tuple[int, int]] = []
+    two = run(SHARED, shapes, "tiny", **OPTIONS, progress=lambda done, of, what: seen.append((done, of)))
+    one = run(SHARED, shapes, "tiny", **{**OPTIONS, "workers": 1})
+    assert without_times(one) == without_times(two)
+    assert seen == [(0, 2), (1, 2), (2, 2)]
+    check_report(one, SHARED)
+
+
+def test_a_tiny_run_on_range_scans(shapes: ShapeLibrary) -> None:
+    check_report(run(SCANS, shapes, "tiny", **OPTIONS), SCANS)
+
+
+def check_report(one: Report, protocol: CropProtocol | RangeProtocol) -> None:
+    content = json.loads(one.to_json())
+    assert content["protocol"]["name"] == protocol.name and content["shapes"] == 2
+    assert len(content["methods"]["utopic"]["weights_sha256"]) == 64
+    stages = [SOLVED, REFINED] if protocol is SCANS else [FLOOR, SOLVED, REFINED]
+    assert [answer["stage"] for answer in content["answers"]] == stages * 2
+    assert {answer["shape"] for answer in content["answers"]} <= {
+        "b",
+        "c",
+    }  # never one of the training shapes
+    assert [row["stage"] for row in content["summary"]] == stages
+    assert ("UTOPIC" in content["quoted"]) == (protocol is SHARED)
+
+    text = printed(one)
+    assert "2 pairs of 2 'val' shapes, tiny" in text
+    assert ("UTOPIC (quoted)" in text) == ("statistical floor" in text) == (protocol is SHARED)
+
+
+def test_only_shapes_held_out_are_measured_on(shapes: ShapeLibrary) -> None:
+    assert held_out(shapes)[0].names.tolist() == ["b", "c"]
+    tests = replace(shapes, splits=np.array(["train", "val", "test"]))
+    assert held_out(tests)[1] == "test" and held_out(tests)[0].names.tolist() == ["c"]
+    with pytest.raises(InputError, match="no 'val' shapes"):
+        held_out(replace(shapes, splits=np.array(["train"] * 3)))
+
+
+def test_shapes_that_make_no_pair_end_the_run(shapes: ShapeLibrary) -> None:
+    flat = pack([(np.zeros((3, 3)), np.array([[0, 1, 2]]))], ["flat"], ["val"], ["one"])
+    with pytest.raises(InputError, match="tiny: no usable pair"):
+        synthetic.answers_to(SHARED, flat, "tiny", 0, 100, (), 0)
+
+
+def test_numbers_that_make_no_sense(shapes: ShapeLibrary) -> None:
+    for wrong in ({"pairs": 0}, {"workers": 0}, {"seed": -1}):
+        with pytest.raises(UsageError, match="at least 1"):
+            run(SHARED, shapes, "tiny", **wrong)
+
+
+def test_fpfh_is_measured_beside(shapes: ShapeLibrary) -> None:
+    pytest.importorskip("open3d")
+    pair = SCANS.pair(shapes, 0, 0)
+    solved, _ = answer_pair(pair, 0, SCANS, [Fpfh()], 400)
+    assert solved.first_overlap is None and solved.final_overlap is None
+    assert solved.cpu_seconds.keys() == {"look", "solve"}
+    assert len(prepare(pair.source, pair.target, 400).source.points) <= 400
+    assert solved.matches is not None and solved.matches.hit_rate is not None
+    assert solved.matches.hit_rate > 0.05

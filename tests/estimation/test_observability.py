@@ -1,0 +1,121 @@
+"""Shapes whose free motions are known, seen through noisy samples and estimated normals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.estimation.conftest import lumpy_surface
+from utopic_cli.estimation.observability import observe
+from utopic_cli.estimation.surface import Surface, make_surface
+from utopic_cli.geometry import rigid
+from utopic_cli.geometry.normals import estimate_normals, orient_towards
+from utopic_cli.geometry.voxel import voxel_downsample
+from utopic_cli.point_cloud import PointCloud
+
+VOXEL = 0.05
+
+
+def surface(points: np.ndarray, viewpoint: np.ndarray) -> Surface:
+    """A scan as the solver sees it: one point a voxel, normals from neighbours."""
+    dense, _ = voxel_downsample(points, VOXEL)
+    normals = orient_towards(dense, estimate_normals(dense, 30, 3 * VOXEL), viewpoint)
+    return make_surface(PointCloud(dense, normals), VOXEL)
+
+
+def plane(rng: np.random.Generator) -> np.ndarray:
+    points = rng.uniform(-1, 1, (30_000, 3)) * [1.0, 0.8, 0.0]
+    return points + rng.normal(0, 0.1 * VOXEL, points.shape)
+
+
+def cylinder(rng: np.random.Generator) -> np.ndarray:
+    angle, height = rng.uniform(-1.2, 1.2, 30_000), rng.uniform(-1, 1, 30_000)
+    points = np.stack([np.cos(angle), np.sin(angle), height], axis=1)
+    return points + rng.normal(0, 0.1 * VOXEL, points.shape)
+
+
+def sphere(rng: np.random.Generator) -> np.ndarray:
+    points = rng.standard_normal((40_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = points[points[:, 0] > 0.3]
+    return points + rng.normal(0, 0.1 * VOXEL, points.shape)
+
+
+def vase(rng: np.random.Generator) -> np.ndarray:
+    """A surface of revolution about the z axis."""
+    angle, height = rng.uniform(-1.5, 1.5, 40_000), rng.uniform(-1, 1, 40_000)
+    radius = 0.6 + 0.2 * np.sin(4 * height)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+
+
+def corner(rng: np.random.Generator) -> np.ndarray:
+    sides = rng.uniform(0, 1, (30_000, 3))
+    sides[np.arange(30_000), rng.integers(0, 3, 30_000)] = 0.0
+    return sides
+
+
+@pytest.fixture
+def pose() -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return rigid.rigid(rigid.random_rotation(rng), rng.standard_normal(3))
+
+
+@pytest.fixture
+def far() -> np.ndarray:
+    return np.array([20.0, 3.0, 40.0])
+
+
+@pytest.mark.parametrize(
+    ("shape", "rotations", "translations"),
+    [(plane, 1, 2), (cylinder, 1, 1), (sphere, 3, 0), (vase, 1, 0), (corner, 0, 0)],
+    ids=lambda value: getattr(value, "__name__", str(value)),
+)
+def test_free_motions_of_known_shapes_are_counted_in_any_pose(shape, rotations, translations, pose, far):
+    rng = np.random.default_rng(0)
+    viewpoint = far if shape is plane else np.array([40.0, 5.0, 8.0])
+    source = surface(shape(rng), viewpoint)
+    target = surface(rigid.apply(pose, shape(rng)), rigid.apply(pose, viewpoint))
+    found = observe(source, target, pose)
+    kinds = [motion.kind for motion in found.free]
+    assert (kinds.count("rotation"), kinds.count("translation")) == (rotations, translations)
+    assert (np.diff(found.eigenvalues) >= 0).all()
+
+
+def test_axes_are_where_they_are(pose):
+    rng = np.random.default_rng(1)
+    viewpoint = np.array([40.0, 5.0, 8.0])
+    source = surface(cylinder(rng), viewpoint)
+    target = surface(rigid.apply(pose, cylinder(rng)), rigid.apply(pose, viewpoint))
+    axis, through = pose[:3, 2], pose[:3, 3]
+    for motion in observe(source, target, pose).free:
+        assert abs(motion.axis @ axis) > np.cos(np.radians(2.0))
+        if motion.kind == "rotation":
+            off = motion.point - through
+            assert np.linalg.norm(off - (off @ axis) * axis) < 0.05
+
+
+def test_the_covariance_is_that_of_repeated_fits():
+    """Point-to-plane fits of noisy copies scatter as the covariance says."""
+    rng = np.random.default_rng(2)
+    cloud = lumpy_surface(6000, 0.0)
+    sigma, voxel = 0.002, 0.03
+    target = make_surface(cloud, voxel)
+    predicted, twists = [], []
+    for _ in range(60):
+        noisy = PointCloud(
+            cloud.points + rng.normal(0, sigma, (len(cloud), 1)) * cloud.normals, cloud.normals
+        )
+        found = observe(make_surface(noisy, voxel), target, np.eye(4))
+        rows = np.concatenate([np.cross(cloud.points - found.centre, cloud.normals), cloud.normals], axis=1)
+        offsets = np.einsum("nd,nd->n", cloud.points - noisy.points, cloud.normals)
+        twists.append(np.linalg.lstsq(rows, offsets, rcond=None)[0])
+        predicted.append(found.covariance)
+    measured = np.cov(np.array(twists).T)
+    ratio = np.sqrt(np.diag(np.mean(predicted, axis=0)) / np.diag(measured))
+    assert ((ratio > 0.7) & (ratio < 1.4)).all()
+
+
+def test_surfaces_that_do_not_meet_have_no_answer():
+    cloud = make_surface(lumpy_surface(3000, 0.0), 0.03)
+    with pytest.raises(ValueError, match="only 0 points overlap"):
+        observe(cloud, cloud, rigid.rigid(np.eye(3), np.array([50.0, 0, 0])))

@@ -1,0 +1,196 @@
+"""Answers of every method to one synthetic pair, measured."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from utopic_cli.benchmark.matcher import Look, Matcher, solve_pair
+from utopic_cli.benchmark.pair_metrics import (
+    KnownNodes,
+    MatchMeasures,
+    OverlapMeasures,
+    PoseMeasures,
+    known_nodes,
+    measure_matches,
+    measure_overlap,
+    measure_pose,
+)
+from utopic_cli.benchmark.protocols import AnyProtocol
+from utopic_cli.estimation.procrustes import weighted_procrustes
+from utopic_cli.estimation.refinement import refine
+from utopic_cli.preprocess import PreparedPair, prepare
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from utopic_cli.synthesis.pairs import ScanPair
+
+SOLVED, REFINED, FLOOR = "solved", "refined", "floor"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One method's answer to one pair at one stage.
+
+    Attributes:
+        pair: number of the pair.
+        group: group of the table it belongs to.
+        shape: name of the shape.
+        overlap: overlap ratio of the smaller side.
+        extent: of the whole object, in the points' unit.
+        method: name of the matcher, or ``floor``.
+        stage: ``solved`` (matches and one robust solve), ``refined`` (after refinement at full
+            resolution), or ``floor`` (Procrustes on the true correspondences).
+        gt_T_target_source: (4, 4) the known answer.
+        T_target_source: (4, 4) the answer, or None.
+        pose: how far it is off, or None.
+        matches: of the view that the answer rests on; None for the floor.
+        first_overlap: overlap told without a transformation; None from who tells none.
+        final_overlap: overlap told when shown the answer (the pipeline's last look).
+        score: the solver's score of it.
+        cpu_seconds: by step: look, solve, refine, look_again.
+        message: what was raised where there is no answer.
+    """
+
+    pair: int
+    group: str
+    shape: str | None
+    overlap: float
+    extent: float
+    method: str
+    stage: str
+    gt_T_target_source: np.ndarray
+    T_target_source: np.ndarray | None = None
+    pose: PoseMeasures | None = None
+    matches: MatchMeasures | None = None
+    first_overlap: OverlapMeasures | None = None
+    final_overlap: OverlapMeasures | None = None
+    score: float | None = None
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    message: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready data."""
+        content = asdict(self)
+        for name in ("gt_T_target_source", "T_target_source"):
+            content[name] = None if content[name] is None else content[name].tolist()
+        return content
+
+
+def answer_pair(
+    pair: ScanPair, number: int, protocol: AnyProtocol, matchers: Sequence[Matcher], points: int
+) -> list[Answer]:
+    """Ask every matcher for a transformation, and measure it before and after refinement.
+
+    Args:
+        pair: with a sample of the whole object.
+        number: of the pair in its protocol.
+        protocol: says in which units errors are counted.
+        matchers: who is asked.
+        points: most sampled points per cloud.
+    """
+    desk = _Desk(pair, number, protocol, prepare(pair.source, pair.target, points))
+    answers = [] if pair.shared is None else [desk.floor(pair.shared)]
+    for matcher in matchers:
+        answers += desk.ask(matcher)
+    return answers
+
+
+class _Desk:
+    """One pair and everything that is known about it."""
+
+    def __init__(self, pair: ScanPair, number: int, protocol: AnyProtocol, prepared: PreparedPair) -> None:
+        self._pair, self._protocol, self._prepared = pair, protocol, prepared
+        self._about: dict[str, Any] = {
+            "pair": number,
+            "group": protocol.group(number),
+            "shape": pair.shape,
+            "overlap": pair.smaller_overlap,
+            "extent": pair.extent,
+            "gt_T_target_source": pair.gt_T_target_source,
+        }
+        # Turning a cloud inside out moves no node, so this holds whatever the solve does.
+        self._known: KnownNodes = known_nodes(
+            prepared, pair.gt_T_target_source, protocol.overlap_radius(prepared)
+        )
+
+    def floor(self, shared: np.ndarray) -> Answer:
+        """The best anybody can do who knows the correspondences, but not the noise."""
+        source, target = self._pair.source.points[shared[:, 0]], self._pair.target.points[shared[:, 1]]
+        try:
+            T = weighted_procrustes(source, target, np.ones(len(shared)))
+        except ValueError as error:
+            return Answer(**self._about, method=FLOOR, stage=FLOOR, message=str(error))
+        return Answer(**self._about, method=FLOOR, stage=FLOOR, T_target_source=T, pose=self._pose(T))
+
+    def ask(self, matcher: Matcher) -> list[Answer]:
+        """Return the answers ``solved`` and ``refined``."""
+        seconds: dict[str, float] = {}
+        with _cpu(seconds, "look"):
+            view = matcher.look(self._prepared)
+        try:
+            with _cpu(seconds, "solve"):
+                look = solve_pair(self._prepared, view, matcher)
+        except ValueError as error:  # no transformation follows from the scores
+            return [
+                Answer(
+                    **self._about, method=matcher.name, stage=stage, cpu_seconds=seconds, message=str(error)
+                )
+                for stage in (SOLVED, REFINED)
+            ]
+        T = look.prepared.denormalise(look.estimate.T_target_source)
+        refining = dict(seconds)
+        with _cpu(refining, "refine"):
+            refined = refine(self._pair.source, self._pair.target, T).T_target_source
+        return [
+            self._answer(matcher, look, T, SOLVED, seconds),
+            self._answer(matcher, look, refined, REFINED, refining),
+        ]
+
+    def _answer(
+        self, matcher: Matcher, look: Look, T: np.ndarray, stage: str, seconds: dict[str, float]
+    ) -> Answer:
+        first = final = None
+        if matcher.tells_overlap:
+            first = final = measure_overlap(look.view, self._known)
+            if matcher.looks_again:
+                with _cpu(seconds, "look_again"):
+                    again = matcher.look(look.prepared, look.prepared.normalise(T))
+                final = measure_overlap(again, self._known)
+        inlier_radius = self._protocol.inlier_radius(look.prepared)
+        return Answer(
+            **self._about,
+            method=matcher.name,
+            stage=stage,
+            T_target_source=T,
+            pose=self._pose(T),
+            matches=measure_matches(look.view.matching_scores, self._known, inlier_radius),
+            first_overlap=first,
+            final_overlap=final,
+            score=look.estimate.score,
+            cpu_seconds=seconds,
+        )
+
+    def _pose(self, T: np.ndarray) -> PoseMeasures:
+        return measure_pose(
+            T,
+            self._pair.gt_T_target_source,
+            self._protocol.unit(self._pair),
+            centre=self._protocol.centre(self._pair),
+            object_points=self._pair.object_points,
+            extent=self._pair.extent,
+        )
+
+
+@contextmanager
+def _cpu(seconds: dict[str, float], step: str) -> Iterator[None]:
+    """Note the CPU time of the block, all threads of this process."""
+    begin = time.process_time()
+    yield
+    seconds[step] = time.process_time() - begin

@@ -1,0 +1,131 @@
+"""Protocols on synthetic pairs: ``modelnet``, ``modelonet``, ``range-scans``.
+
+Definitions: ``protocols``. Every method meets the same pairs in the same run, its matches go into
+the same robust solve, and the answer is measured twice: as solved (no refinement), and after
+refinement at full resolution.
+
+For commands: ``report = run(protocol, shapes, ...)``, then ``render(report, console)`` prints the
+tables and ``report.to_json()`` is the text of the JSON file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from utopic_cli.benchmark.answers import Answer, answer_pair
+from utopic_cli.benchmark.matcher import Matcher, load_matchers
+from utopic_cli.benchmark.pool import each
+from utopic_cli.benchmark.protocols import AnyProtocol
+from utopic_cli.benchmark.synthetic_report import SCHEMA_VERSION, Report, render
+from utopic_cli.benchmark.versions import versions
+from utopic_cli.config import AlignOptions
+from utopic_cli.errors import InputError, UsageError
+from utopic_cli.synthesis.scan_pair import DegeneratePair
+from utopic_cli.synthesis.shapes import ShapeLibrary
+
+__all__ = ["Report", "held_out", "render", "run"]
+
+Progress = Callable[[int, int, str], None]
+
+
+def held_out(shapes: ShapeLibrary) -> tuple[ShapeLibrary, str]:
+    """Return the shapes that no training sees, and the name of their split.
+
+    Raises:
+        InputError: there are none.
+    """
+    split = "test" if "test" in shapes.splits else "val"
+    return shapes.select(split), split
+
+
+def run(
+    protocol: AnyProtocol,
+    shapes: ShapeLibrary,
+    data: str,
+    pairs: int = 300,
+    seed: int = 0,
+    weights: Sequence[str] = ("utopic",),
+    baselines: Sequence[str] = (),
+    workers: int = 1,
+    points: int = AlignOptions().points,
+    device: str = "auto",
+    progress: Progress | None = None,
+) -> Report:
+    """Measure weights and baselines on the pairs of a protocol.
+
+    Args:
+        protocol: makes the pairs.
+        shapes: a library; only its shapes held out from training are used.
+        data: what to call them.
+        pairs: how many pairs in all.
+        seed: of the pairs and of the networks' own draws.
+        weights: bundled names or paths.
+        baselines: names from ``matcher.BASELINES``.
+        workers: processes, each with one thread; the results do not depend on their number.
+        points: most sampled points per cloud.
+        device: of the networks.
+        progress: called with (pairs done, pairs in all, what goes on).
+
+    Raises:
+        InputError: no held-out shapes, no pair can be made of them, or weights can't be used.
+        UsageError: a number makes no sense, or an unknown or unusable baseline.
+    """
+    if pairs < 1 or workers < 1 or seed < 0:
+        raise UsageError("pairs and workers must be at least 1, and the seed not negative")
+    test, split = held_out(shapes)
+    load = partial(load_matchers, tuple(weights), tuple(baselines), seed, device)
+    settings = {
+        "schema_version": SCHEMA_VERSION,
+        "protocol": protocol.settings(),
+        "data": data,
+        "split": split,
+        "shapes": len(test),
+        "pairs": pairs,
+        "seed": seed,
+        "points": points,
+        "workers": workers,
+        # Loaded here once, so that what can't be used ends the run before any work.
+        "methods": {matcher.name: matcher.settings() for matcher in load()},
+        "versions": versions(),
+    }
+
+    def tell(done: int, of: int) -> None:
+        if progress is not None:
+            progress(done, of, f"{protocol.name}, pairs of {data}")
+
+    answers = each(partial(_task, protocol, test, data, seed, points, load), pairs, workers, tell)
+    return Report(settings, protocol.groups, tuple(answer for some in answers for answer in some))
+
+
+def _task(
+    protocol: AnyProtocol,
+    shapes: ShapeLibrary,
+    data: str,
+    seed: int,
+    points: int,
+    load: Callable[[], tuple[Matcher, ...]],
+) -> Callable[[int], list[Answer]]:
+    """What a worker does once, before it answers pairs by number."""
+    return partial(answers_to, protocol, shapes, data, seed, points, load())
+
+
+def answers_to(
+    protocol: AnyProtocol,
+    shapes: ShapeLibrary,
+    data: str,
+    seed: int,
+    points: int,
+    matchers: tuple[Matcher, ...],
+    number: int,
+) -> list[Answer]:
+    """Make pair ``number`` and let every matcher answer it; arguments as for ``run``.
+
+    Raises:
+        InputError: no such pair can be made of the shapes.
+    """
+    try:
+        pair = protocol.pair(shapes, seed, number)
+    except DegeneratePair as error:
+        raise InputError(f"{data}: {error}; give more or other shapes") from error
+    return answer_pair(pair, number, protocol, matchers, points)

@@ -1,0 +1,225 @@
+"""What a protocol on synthetic pairs found: every answer, the summary, tables and JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from utopic_cli.benchmark.answers import FLOOR, REFINED, Answer
+from utopic_cli.benchmark.quoted import METRICS, QUOTED
+from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Share, Summary, summarise
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything one run found.
+
+    Attributes:
+        settings: the protocol's definition, what was asked for, the methods, versions and machine.
+        groups: names of the groups of pairs, in the order of the table.
+        answers: in the order of pairs, methods, stages.
+    """
+
+    settings: dict[str, Any]
+    groups: tuple[str, ...]
+    answers: tuple[Answer, ...]
+
+    @property
+    def title(self) -> str:
+        """Protocol and data in one line."""
+        protocol = self.settings["protocol"]
+        how = [f"{protocol[key]}" for key in ("sampling", "rotations") if key in protocol]
+        name = f"{protocol['name']} ({', '.join(how)})" if how else protocol["name"]
+        return (
+            f"{name}: {self.settings['pairs']} pairs of {self.settings['shapes']} '{self.settings['split']}' "
+            f"shapes, {self.settings['data']}, seed {self.settings['seed']}"
+        )
+
+    def summaries(self) -> dict[tuple[str, str, str], Summary]:
+        """Summarise by (group, method, stage), in the order of the table."""
+        table = {}
+        for group in self.groups:
+            members = [answer for answer in self.answers if answer.group == group]
+            floor = [answer for answer in members if answer.stage == FLOOR]
+            for method, stage in dict.fromkeys((answer.method, answer.stage) for answer in members):
+                own = [answer for answer in members if (answer.method, answer.stage) == (method, stage)]
+                table[group, method, stage] = summarise(own, floor)
+        return table
+
+    def to_json(self) -> str:
+        """Return the whole report as JSON text, one answer a line."""
+        rows = [
+            {"group": group, "method": method, "stage": stage, **asdict(summary)}
+            for (group, method, stage), summary in self.summaries().items()
+        ]
+        head = json.dumps(
+            {**self.settings, "quoted": self._quoted(), "summary": rows}, indent=2, allow_nan=False
+        )
+        lines = ",\n    ".join(json.dumps(answer.to_dict(), allow_nan=False) for answer in self.answers)
+        return f'{head[:-2]},\n  "answers": [\n    {lines}\n  ]\n}}\n'
+
+    def _quoted(self) -> dict[str, dict[str, float]]:
+        rows = QUOTED.get(self.settings["protocol"]["name"], {})
+        return {name: dict(zip(METRICS, values)) for name, values in rows.items()}
+
+    def quoted_rows(self) -> list[list[str]]:
+        """Return the paper's figures as cells: name and six metrics."""
+        return [
+            [f"{name} (quoted)", *(_number(row[key], _FORMS[key]) for key in METRICS)]
+            for name, row in self._quoted().items()
+        ]
+
+
+_FORMS = {
+    "rmse_r": "{:.4f}",
+    "mae_r": "{:.4f}",
+    "rmse_t": "{:.5f}",
+    "mae_t": "{:.5f}",
+    "error_r": "{:.4f}",
+    "error_t": "{:.5f}",
+}
+
+
+def render(report: Report, console: Console) -> None:
+    """Print the tables: poses, the paper's six metrics, matches and overlap."""
+    console.print(_poses(report))
+    if report.quoted_rows():
+        console.print(_paper(report))
+    console.print(_matches(report))
+    lost = [(a.method, a.message) for a in report.answers if a.message]
+    for method, message in sorted(set(lost)):
+        count = lost.count((method, message))
+        console.print(f"{method}: no answer {count} times: {message}", markup=False, highlight=False)
+
+
+def _poses(report: Report) -> Table:
+    protocol = report.settings["protocol"]
+    table = _table(
+        report.title,
+        f"recall: both errors are less; lengths in: {protocol['length_unit']}; translations compared "
+        f"{protocol['translation_error']}; or symmetric: or the object lies within 2 % of its extent of its "
+        "place; [95 % Wilson interval]",
+        (
+            "Error(R)\nmean, deg",
+            "\nmedian",
+            "Error(t)\nmean",
+            "recall\n1 deg, .02",
+            "recall\n5 deg, .05",
+            "or symmetric",
+            "x floor\nR",
+            "x floor\nt",
+            "CPU, s",
+        ),
+    )
+    previous = ""
+    for (group, method, stage), row in report.summaries().items():
+        if group != previous and previous:
+            table.add_section()
+        table.add_row(
+            group if group != previous else "",
+            _who(method, stage),
+            _number(row.error_r, "{:.3f}"),
+            _number(row.error_r_median, "{:.3f}"),
+            _number(row.error_t, "{:.4f}"),
+            f"{row.fine.share:.1%}",
+            f"{row.success.share:.1%}",
+            _share(row.symmetric_success),
+            _number(row.floor_ratio_r, "{:.2f}"),
+            _number(row.floor_ratio_t, "{:.2f}"),
+            f"{sum(row.cpu_seconds.values()):.2f}",
+        )
+        previous = group
+    return table
+
+
+def _paper(report: Report) -> Table:
+    table = _table(
+        "The paper's metrics",
+        "quoted: from the paper, on ModelNet40 with shared points and its rotations, other pairs than these",
+        ("RMSE(R)", "MAE(R)", "RMSE(t)", "MAE(t)", "Error(R)", "Error(t)"),
+    )
+    for (group, method, stage), row in report.summaries().items():
+        cells = [_number(getattr(row, key), _FORMS[key]) for key in METRICS]
+        table.add_row(group, _who(method, stage), *cells)
+    table.add_section()
+    for name, *cells in report.quoted_rows():
+        table.add_row("", name, *cells)
+    return table
+
+
+def _matches(report: Report) -> Table:
+    table = _table(
+        "Matches and overlap at the sampled points",
+        "accuracy / precision / recall at 0.5; mutual: accuracy by the paper's labels (mutual nearest "
+        "neighbours); final: shown the answer; CPU seconds",
+        (
+            "hit rate",
+            "inliers of\nsurest 250",
+            "first overlap\nacc / prec / rec",
+            "\nmutual",
+            "final overlap\nacc / prec / rec",
+            "\nmutual",
+            "look",
+            "solve",
+            "refine",
+        ),
+    )
+    previous = ""
+    for (group, method, stage), row in report.summaries().items():
+        if stage == FLOOR:
+            continue
+        if group != previous and previous:
+            table.add_section()
+        table.add_row(
+            group if group != previous else "",
+            _who(method, stage),
+            _number(row.hit_rate, "{:.3f}"),
+            _number(row.inlier_ratio, "{:.3f}"),
+            *_overlap(row.first_overlap),
+            *_overlap(row.final_overlap),
+            *(_number(row.cpu_seconds.get(step), "{:.2f}") for step in ("look", "solve", "refine")),
+        )
+        previous = group
+    return table
+
+
+def _table(title: str, caption: str, headings: tuple[str, ...]) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=escape(title), caption=escape(caption))
+    table.add_column("pairs")
+    table.add_column("method")
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    return table
+
+
+def _who(method: str, stage: str) -> str:
+    from rich.markup import escape
+
+    if stage == FLOOR:
+        return "statistical floor"
+    return escape(f"{method} + refinement" if stage == REFINED else method)
+
+
+def _share(share: Share) -> str:
+    return f"{share.share:.1%} \\[{100 * share.low:.0f}-{100 * share.high:.0f}]"
+
+
+def _overlap(summary: OverlapSummary | None) -> tuple[str, str]:
+    if summary is None:
+        return "-", "-"
+    parts = (summary.accuracy, summary.precision, summary.recall)
+    return " / ".join(_number(part, "{:.3f}") for part in parts), f"{summary.accuracy_mutual:.3f}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

@@ -1,0 +1,119 @@
+"""Whether raw uncertainty means something: where on a pair it is high, and on which pairs.
+
+The paper's claim (Sec. 3.3.2) is that overlap is uncertain at the border of the overlap and
+where a surface shows nothing to go by. Raw variance is compared, not the min-max normalised one,
+which can't say that a whole pair is bad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from utopic_cli.bridge import NetworkView
+from utopic_cli.preprocess import PreparedPair, SampledCloud
+
+BORDER_REACH = 2.2
+"""A node is at the border if one of the other kind lies within this many node spacings."""
+
+PLACES = ("border", "inside", "outside", "plain", "rich")
+"""At the border of the overlap; in it, off the border; out of it, off the border; and of the nodes
+in the overlap, off the border, the quarter with the least and that with the most relief."""
+
+
+@dataclass(frozen=True)
+class UncertaintyByPlace:
+    """Mean raw uncertainty of one pair by place.
+
+    Attributes:
+        mean: over all nodes of both clouds.
+        places: mean by place of ``PLACES``; None where a pair has fewer than five such nodes.
+        border_auc: probability that a node at the border is more uncertain than one inside (half
+            for ties); None without both.
+        plain_auc: the same of a plain one against a rich one.
+    """
+
+    mean: float
+    places: dict[str, float | None]
+    border_auc: float | None
+    plain_auc: float | None
+
+
+def measure_uncertainty(
+    prepared: PreparedPair, view: NetworkView, source_overlap: np.ndarray, target_overlap: np.ndarray
+) -> UncertaintyByPlace:
+    """Sort the nodes of a pair by place and compare their raw uncertainty.
+
+    Args:
+        prepared: the pair.
+        view: what the network said of it.
+        source_overlap: (N,) bool, known.
+        target_overlap: (M,) bool, known.
+    """
+    found: dict[str, list[np.ndarray]] = {place: [] for place in PLACES}
+    sides = (
+        (prepared.source, source_overlap, view.source_raw),
+        (prepared.target, target_overlap, view.target_raw),
+    )
+    for cloud, overlap, raw in sides:
+        border = _at_border(cloud.points, overlap, BORDER_REACH * prepared.spacing)
+        inside = overlap & ~border
+        plain, rich = _quarters(relief(cloud), inside)
+        where = {
+            "border": border,
+            "inside": inside,
+            "outside": ~overlap & ~border,
+            "plain": plain,
+            "rich": rich,
+        }
+        for place, chosen in where.items():
+            found[place].append(raw[chosen])
+    values = {place: np.concatenate(parts) for place, parts in found.items()}
+    return UncertaintyByPlace(
+        float(np.concatenate([view.source_raw, view.target_raw]).mean()),
+        {place: float(raw.mean()) if len(raw) >= 5 else None for place, raw in values.items()},
+        area_under_curve(values["border"], values["inside"]),
+        area_under_curve(values["plain"], values["rich"]),
+    )
+
+
+def relief(cloud: SampledCloud) -> np.ndarray:
+    """How much the surface bends around each node: 1 - length of the mean normal of its neighbours (N,)."""
+    around = cloud.normals[cloud.neighbours].mean(axis=1)
+    return 1.0 - np.linalg.norm(around, axis=1)
+
+
+def area_under_curve(
+    positives: Sequence[float] | np.ndarray, negatives: Sequence[float] | np.ndarray
+) -> float | None:
+    """Probability that a positive's value is larger than a negative's, ties counting half.
+
+    Returns:
+        In [0, 1]; None if either is empty.
+    """
+    high, low = np.asarray(positives, dtype=np.float64), np.sort(np.asarray(negatives, dtype=np.float64))
+    if not len(high) or not len(low):
+        return None
+    below = np.searchsorted(low, high, side="left") + np.searchsorted(low, high, side="right")
+    return float(below.mean() / (2.0 * len(low)))
+
+
+def _at_border(points: np.ndarray, overlap: np.ndarray, reach: float) -> np.ndarray:
+    """Nodes near one of the other kind (N,) bool."""
+    border = np.zeros(len(points), dtype=bool)
+    if overlap.any() and not overlap.all():
+        for kind in (overlap, ~overlap):
+            distance, _ = cKDTree(points[~kind]).query(points[kind], distance_upper_bound=reach)
+            border[kind] = np.isfinite(distance)
+    return border
+
+
+def _quarters(values: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the chosen nodes, the quarter with the smallest and that with the largest values."""
+    if among.sum() < 4:
+        return np.zeros_like(among), np.zeros_like(among)
+    low, high = np.quantile(values[among], [0.25, 0.75])
+    return among & (values <= low), among & (values >= high) & (values > low)
