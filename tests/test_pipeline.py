@@ -151,6 +151,32 @@ def test_a_right_initial_transformation_is_used(pair):
     assert rotation_error(found.T_target_source, pair.gt_T_target_source) < 5
 
 
+def test_the_overlap_of_an_asymmetric_object_fixes_every_motion(pair, result):
+    seen = result.observability
+    assert seen is not None and not seen.free
+    spread = np.sqrt(np.diag(seen.covariance))
+    extent = np.linalg.norm(np.ptp(pair.source.points, axis=0))
+    assert (spread[:3] < np.radians(0.5)).all() and (spread[3:] < 0.005 * extent).all()
+    # The covariance scales with the unit, and its middle lies in the target's overlap.
+    assert np.linalg.norm(seen.centre - pair.target.points.mean(axis=0)) < extent
+
+
+def test_a_motion_that_the_surfaces_leave_free_is_named():
+    rng = np.random.default_rng(0)
+    tubes = []
+    for low, high in ((-1.0, 0.6), (-0.6, 1.0)):
+        angle, height = rng.uniform(-1.4, 1.4, 9000), rng.uniform(low, high, 9000)
+        tubes.append(1000.0 * np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), height], axis=1))
+    found = align(*tubes, seed=0)
+    assert found.observability is not None
+    assert {motion.kind for motion in found.observability.free} == {"rotation", "translation"}
+    for motion in found.observability.free:
+        assert abs(motion.axis[2]) > 0.99
+        if motion.point is not None:
+            assert np.linalg.norm(motion.point[:2]) < 50.0
+    assert any("not determined" in text and "sliding along" in text for text in found.warnings)
+
+
 def test_the_papers_solver_returns_a_rigid_motion(pair):
     found = register(pair.source, pair.target, dataclasses.replace(OPTIONS, solver="svd", refine=False))
     assert rigid.is_rigid(found.T_target_source, 1e-9)

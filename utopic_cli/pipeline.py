@@ -13,17 +13,18 @@ import numpy as np
 from utopic_cli.bridge import NetworkView, cpu_threads, load_network, predict
 from utopic_cli.config import SOLVERS, AlignOptions
 from utopic_cli.errors import InputError, UsageError
+from utopic_cli.estimation.observability import observe
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.solver import Estimate, Problem, solve
-from utopic_cli.estimation.surface import point_spacing
+from utopic_cli.estimation.surface import make_surface, point_spacing
 from utopic_cli.estimation.verification import measure_fit
 from utopic_cli.geometry import rigid
 from utopic_cli.io.records import FormatError
 from utopic_cli.io.scan import check_points, read_scan
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.point_cloud import PointCloud
-from utopic_cli.preprocess import PreparedPair, carry_to_all, prepare
-from utopic_cli.result import Correspondences, FitMeasures, RegistrationResult
+from utopic_cli.preprocess import DENSE_RATIO, PreparedPair, carry_to_all, prepare
+from utopic_cli.result import Correspondences, FitMeasures, FreeMotion, Observability, RegistrationResult
 
 Progress = Callable[[str], None]
 
@@ -137,6 +138,7 @@ def _register(
     correspondences = _in_original_points(estimate.correspondences, prepared)
     threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
     fit = measure_fit(source, target, transformation, threshold, estimate.support)
+    observability = _observe(prepared, transformation)
     rivals = [rival for rival in estimate.rivals if rival.score > RIVAL_SHARE * estimate.score]
     clock.start("carry to all points")
     source_all = _carry(
@@ -164,8 +166,9 @@ def _register(
         raw_uncertainty=_summary(view),
         correspondences=correspondences,
         fit=fit,
+        observability=observability,
         timings_s=clock.stop(),
-        warnings=_warnings(source, target, fit, len(rivals)),
+        warnings=_warnings(source, target, fit, observability, len(rivals)),
         weights_name=str(card["name"]),
         weights_sha256=str(card["sha256"]),
         # With what "auto" and 0 came to: device and thread count can change the last bits.
@@ -248,6 +251,28 @@ def _as_cloud(scan: str | PathLike[str] | np.ndarray, name: str, seed: int) -> P
     return PointCloud(finite)
 
 
+def _observe(prepared: PreparedPair, transformation: np.ndarray) -> Observability | None:
+    """Find which motions the overlap fixes, in file units; None if too little overlaps to tell."""
+    voxel = prepared.spacing / DENSE_RATIO
+    source, target = (make_surface(cloud.dense, voxel) for cloud in (prepared.source, prepared.target))
+    try:
+        seen = observe(source, target, prepared.normalise(transformation))
+    except ValueError:
+        return None
+    scale, centre = prepared.scale, prepared.target_centre
+    units = np.concatenate([np.ones(3), np.full(3, scale)])
+    free = tuple(
+        replace(motion, point=None if motion.point is None else scale * motion.point + centre)
+        for motion in seen.free
+    )
+    return replace(
+        seen,
+        free=free,
+        covariance=seen.covariance * np.outer(units, units),
+        centre=scale * seen.centre + centre,
+    )
+
+
 def _in_original_points(nodes: Correspondences, prepared: PreparedPair) -> Correspondences:
     return Correspondences(
         prepared.source.node_index[nodes.source_indices],
@@ -271,12 +296,21 @@ def _summary(view: NetworkView) -> dict[str, float]:
     }
 
 
-def _warnings(source: PointCloud, target: PointCloud, fit: FitMeasures, rivals: int) -> tuple[str, ...]:
+def _warnings(
+    source: PointCloud,
+    target: PointCloud,
+    fit: FitMeasures,
+    observability: Observability | None,
+    rivals: int,
+) -> tuple[str, ...]:
     """Say what a user should know beyond the numbers."""
     warnings = []
     name, share = min(fit.overlap_ratio.items(), key=lambda item: item[1])
     if share < LITTLE_OVERLAP:
         warnings.append(f"only {share:.0%} of the {name} finds a counterpart: the answer is likely wrong")
+    if observability is not None and observability.free:
+        said = " and ".join(_motion_in_words(motion) for motion in observability.free)
+        warnings.append(f"not determined by the surfaces that overlap: {said}")
     if rivals:
         poses = "another pose fits" if rivals == 1 else f"{rivals} other poses fit"
         warnings.append(f"{poses} nearly as well (symmetry, or too little overlap): see ambiguous_with")
@@ -287,6 +321,11 @@ def _warnings(source: PointCloud, target: PointCloud, fit: FitMeasures, rivals: 
             f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?"
         )
     return tuple(warnings)
+
+
+def _motion_in_words(motion: FreeMotion) -> str:
+    axis = ", ".join(f"{value:.2f}" for value in motion.axis + 0.0)
+    return f"rotation about ({axis})" if motion.kind == "rotation" else f"sliding along ({axis})"
 
 
 class _Clock:

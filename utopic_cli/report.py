@@ -1,7 +1,7 @@
 """The JSON report of one registration: everything a later reader or program needs to know.
 
 ``report.json`` is a promise, versioned by ``schema_version``: keys are added, not renamed.
-What this version does not measure yet is null, never left out or guessed; ``not_measured`` says why.
+What could not be measured is null, never left out or guessed; ``not_measured`` says why.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from utopic_cli import __version__
 from utopic_cli.geometry.rigid import apply, rotation_angle_deg
 from utopic_cli.io.scan import Scan
 from utopic_cli.io.transformation import CONVENTION
-from utopic_cli.result import RegistrationResult
+from utopic_cli.result import FreeMotion, RegistrationResult
 
 SCHEMA_VERSION = 1
-NOT_MEASURED = {
-    "unobservable": "this version does not look for axes that the geometry leaves free",
-    "covariance": "this version does not estimate the (6, 6) covariance",
-}
+NOT_OBSERVED = dict.fromkeys(
+    ("unobservable", "covariance", "covariance_about"), "too few points overlap with agreeing normals to tell"
+)
 
 
 def build_report(
@@ -40,7 +39,7 @@ def build_report(
     Returns:
         Nested dictionaries, lists, strings, numbers and None; numbers that are not finite are None.
     """
-    transformation = result.T_target_source
+    transformation, seen = result.T_target_source, result.observability
     report = {
         "schema_version": SCHEMA_VERSION,
         "utopic_cli": __version__,
@@ -63,9 +62,10 @@ def build_report(
         "inlier_rmse": result.fit.inlier_rmse,
         "residual_percentiles": result.fit.residual_percentiles,
         "residual_threshold": result.fit.threshold,
-        "unobservable": None,
-        "covariance": None,
-        "not_measured": NOT_MEASURED,
+        "unobservable": None if seen is None else [_motion_entry(motion) for motion in seen.free],
+        "covariance": None if seen is None else seen.covariance,
+        "covariance_about": None if seen is None else seen.centre,
+        "not_measured": NOT_OBSERVED if seen is None else {},
         "overlap": {
             "source": _distribution(result.source_overlap),
             "target": _distribution(result.target_overlap),
@@ -123,6 +123,10 @@ def about_centroid(transformation: np.ndarray, points: np.ndarray) -> dict[str, 
         "angle_deg": rotation_angle_deg(rotation),
         "translation": apply(transformation, centroid) - centroid,
     }
+
+
+def _motion_entry(motion: FreeMotion) -> dict[str, Any]:
+    return {"kind": motion.kind, "axis": motion.axis, "point": motion.point}
 
 
 def _scan_entry(scan: Scan) -> dict[str, Any]:

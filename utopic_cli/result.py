@@ -51,6 +51,42 @@ class FitMeasures:
 
 
 @dataclass(frozen=True)
+class FreeMotion:
+    """A small motion of the source that the geometry does not fix.
+
+    Attributes:
+        kind: ``rotation`` about an axis, or ``translation`` along one.
+        axis: (3,) unit vector in the target's frame.
+        point: (3,) a point on the axis of a rotation, in the target's frame; None for a translation.
+    """
+
+    kind: str
+    axis: np.ndarray
+    point: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Observability:
+    """How well the overlap fixes the six motions.
+
+    Attributes:
+        eigenvalues: (6,) of the normal matrix per point, ascending, dimensionless: rotations are
+            counted about the middle of the overlap, times its radius.
+        free: motions that are not fixed.
+        covariance: (6, 6) of the twist (omega in radians, v in the points' unit) about ``centre``, in
+            the target's frame; along a free motion it is as large as the floor allows, not infinite.
+        centre: (3,) middle of the overlap, in the target's frame.
+        points: number of points it rests on.
+    """
+
+    eigenvalues: np.ndarray
+    free: tuple[FreeMotion, ...]
+    covariance: np.ndarray
+    centre: np.ndarray
+    points: int
+
+
+@dataclass(frozen=True)
 class RegistrationResult:
     """The answer for one pair of clouds.
 
@@ -70,6 +106,8 @@ class RegistrationResult:
             summarised: keys ``source_mean``, ``target_mean``, ``p50``, ``p90``.
         correspondences: indices into the original points, with weights.
         fit: measures at full resolution.
+        observability: which motions the overlap fixes and how well, in file units; None where too
+            little overlaps to tell.
         timings_s: seconds per step.
         warnings: things a user should know.
         weights_name: name of the network weights used.
@@ -89,6 +127,7 @@ class RegistrationResult:
     raw_uncertainty: dict[str, float]
     correspondences: Correspondences
     fit: FitMeasures
+    observability: Observability | None
     timings_s: dict[str, float]
     warnings: tuple[str, ...] = ()
     weights_name: str = ""

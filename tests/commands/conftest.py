@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from utopic_cli.cli import app
 from utopic_cli.config import to_dict
-from utopic_cli.result import Correspondences, FitMeasures, RegistrationResult
+from utopic_cli.result import Correspondences, FitMeasures, FreeMotion, Observability, RegistrationResult
 
 # A quarter turn about z and a shift: every product below is exact in float64.
 QUARTER_TURN = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
@@ -52,6 +52,13 @@ class FakePipeline:
                 inlier_rmse=0.01,
                 residual_percentiles={"p50": 0.01, "p75": 0.02, "p90": 0.03, "p95": 0.04},
                 threshold=0.05,
+            ),
+            observability=Observability(
+                eigenvalues=np.linspace(0.0, 1.0, 6),
+                free=(FreeMotion("rotation", np.array([0.0, 0, 1]), np.array([1.0, 2, 0])),),
+                covariance=np.eye(6),
+                centre=np.zeros(3),
+                points=40,
             ),
             timings_s={"network": 0.1},
             weights_name="fake",

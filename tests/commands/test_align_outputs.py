@@ -120,6 +120,14 @@ def test_merged_holds_both_scans_in_the_targets_frame(cli, fake, scans, tmp_path
     np.testing.assert_array_equal(xyz(fields)[fields["scan"] == 1], target)
 
 
+def test_what_could_not_be_measured_is_null_with_a_reason(cli, fake, scans, tmp_path):
+    fake.changes = {"observability": None}
+    assert cli("align", *scans, "--report", tmp_path / "r.json").exit_code == 0
+    report = strict_json((tmp_path / "r.json").read_text())
+    assert {"unobservable", "covariance", "covariance_about"} == set(report["not_measured"])
+    assert all(report[name] is None and why for name, why in report["not_measured"].items())
+
+
 def test_the_report_says_everything_promised(cli, fake, scans, tmp_path):
     fake.changes = {"warnings": ("watch out",), "reasons": ("because",)}
     assert cli("align", *scans, "--report", tmp_path / "r.json").exit_code == 0
@@ -134,8 +142,9 @@ def test_the_report_says_everything_promised(cli, fake, scans, tmp_path):
     assert report["schema_version"] == 1
     assert report["convention"] == "p_target = T_target_source @ p_source"
     assert report["confidence"] is None
-    assert all(report[name] is None and why for name, why in report["not_measured"].items())
-    assert {"covariance", "unobservable"} == set(report["not_measured"])
+    assert report["not_measured"] == {}
+    assert report["unobservable"] == [{"kind": "rotation", "axis": [0, 0, 1], "point": [1, 2, 0]}]
+    assert np.shape(report["covariance"]) == (6, 6) and report["covariance_about"] == [0, 0, 0]
     assert report["T_target_source"] == QUARTER_TURN.tolist()
     assert report["source"]["points"] == 60
     assert report["target"]["path"] == str(scans[1])

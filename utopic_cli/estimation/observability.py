@@ -8,12 +8,11 @@ near zero belongs to a motion that slides the surfaces along each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from utopic_cli.estimation.surface import Surface
 from utopic_cli.geometry import rigid
+from utopic_cli.result import FreeMotion, Observability
 
 REACH = 1.5
 """Points within this many voxels of the other surface, with agreeing normals, are in the overlap."""
@@ -24,42 +23,6 @@ FREE = 0.0015
 
 It is what normals that are off by two degrees make of a motion that is really free.
 """
-
-
-@dataclass(frozen=True)
-class FreeMotion:
-    """A motion that the geometry does not fix.
-
-    Attributes:
-        kind: ``rotation`` about an axis, or ``translation`` along one.
-        axis: (3,) unit vector in the target's frame.
-        point: (3,) a point on the axis of a rotation, in the target's frame; None for a translation.
-    """
-
-    kind: str
-    axis: np.ndarray
-    point: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Observability:
-    """How well the overlap fixes the six motions.
-
-    Attributes:
-        eigenvalues: (6,) of the normal matrix per point, ascending, dimensionless: rotations are
-            counted about the middle of the overlap, times its radius.
-        free: motions that are not fixed.
-        covariance: (6, 6) of the twist (omega in radians, v in the points' unit) about ``centre``, in
-            the target's frame; along a free motion it is as large as the floor allows, not infinite.
-        centre: (3,) middle of the overlap, in the target's frame.
-        points: number of points it rests on.
-    """
-
-    eigenvalues: np.ndarray
-    free: tuple[FreeMotion, ...]
-    covariance: np.ndarray
-    centre: np.ndarray
-    points: int
 
 
 def observe(source: Surface, target: Surface, transformation: np.ndarray) -> Observability:
