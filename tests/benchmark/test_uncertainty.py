@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from utopic_cli.benchmark.uncertainty import area_under_curve, measure_uncertainty, relief
+from utopic_cli.benchmark.uncertainty import (
+    PLACES,
+    UncertaintyByPlace,
+    area_under_curve,
+    measure_uncertainty,
+    relief,
+    summarise_uncertainty,
+)
 from utopic_cli.bridge import NetworkView
 from utopic_cli.preprocess import PreparedPair, sample
 
@@ -63,3 +70,15 @@ def test_area_under_the_curve_against_brute_force():
     expected = np.mean((high[:, None] > low) + 0.5 * (high[:, None] == low))
     assert area_under_curve(high, low) == pytest.approx(expected)
     assert area_under_curve([], low) is None
+
+
+def test_pairs_that_fail_are_compared_with_the_others():
+    def pair(mean, border):
+        return UncertaintyByPlace(mean, {**dict.fromkeys(PLACES), "border": border}, 0.7, None)
+
+    found = summarise_uncertainty(
+        [pair(0.1, 0.2), pair(0.3, 0.4), pair(0.2, None)], right=[True, False, True]
+    )
+    assert found.failed == pytest.approx(0.3) and found.right == pytest.approx(0.15)
+    assert found.failed_auc == 1.0 and found.border_auc == pytest.approx(0.7)
+    assert found.places["border"] == pytest.approx(0.3) and found.plain_auc is None

@@ -22,6 +22,7 @@ from utopic_cli.benchmark.pair_metrics import (
     measure_pose,
 )
 from utopic_cli.benchmark.protocols import AnyProtocol
+from utopic_cli.benchmark.uncertainty import UncertaintyByPlace, measure_uncertainty
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.preprocess import PreparedPair, prepare
@@ -53,6 +54,8 @@ class Answer:
         matches: of the view that the answer rests on; None for the floor.
         first_overlap: overlap told without a transformation; None from who tells none.
         final_overlap: overlap told when shown the answer (the pipeline's last look).
+        first_uncertainty: raw uncertainty by place at the first look; None from who tells no overlap.
+        final_uncertainty: the same when shown the answer.
         score: the solver's score of it.
         cpu_seconds: by step: look, solve, refine, look_again.
         message: what was raised where there is no answer.
@@ -71,6 +74,8 @@ class Answer:
     matches: MatchMeasures | None = None
     first_overlap: OverlapMeasures | None = None
     final_overlap: OverlapMeasures | None = None
+    first_uncertainty: UncertaintyByPlace | None = None
+    final_uncertainty: UncertaintyByPlace | None = None
     score: float | None = None
     cpu_seconds: dict[str, float] = field(default_factory=dict)
     message: str | None = None
@@ -156,13 +161,17 @@ class _Desk:
     def _answer(
         self, matcher: Matcher, look: Look, T: np.ndarray, stage: str, seconds: dict[str, float]
     ) -> Answer:
-        first = final = None
+        told: dict[str, Any] = {}
         if matcher.tells_overlap:
-            first = final = measure_overlap(look.view, self._known)
+            again = look.view
             if matcher.looks_again:
                 with _cpu(seconds, "look_again"):
                     again = matcher.look(look.prepared, look.prepared.normalise(T))
-                final = measure_overlap(again, self._known)
+            for name, view in (("first", look.view), ("final", again)):
+                told[f"{name}_overlap"] = measure_overlap(view, self._known)
+                told[f"{name}_uncertainty"] = measure_uncertainty(
+                    look.prepared, view, self._known.source_overlap, self._known.target_overlap
+                )
         inlier_radius = self._protocol.inlier_radius(look.prepared)
         return Answer(
             **self._about,
@@ -171,8 +180,7 @@ class _Desk:
             T_target_source=T,
             pose=self._pose(T),
             matches=measure_matches(look.view.matching_scores, self._known, inlier_radius),
-            first_overlap=first,
-            final_overlap=final,
+            **told,
             score=look.estimate.score,
             cpu_seconds=seconds,
         )

@@ -6,9 +6,10 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from utopic_cli.benchmark.answers import FLOOR, REFINED, Answer
+from utopic_cli.benchmark.answers import FLOOR, REFINED, SOLVED, Answer
 from utopic_cli.benchmark.quoted import METRICS, QUOTED
 from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Share, Summary, summarise
+from utopic_cli.benchmark.uncertainty import UncertaintySummary, summarise_uncertainty
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,15 +54,34 @@ class Report:
                 table[group, method, stage] = summarise(own, floor)
         return table
 
+    def uncertainties(self) -> dict[tuple[str, str], UncertaintySummary]:
+        """Summarise raw uncertainty over all groups, by (method, look) with look ``first`` or ``final``."""
+        solved = [answer for answer in self.answers if answer.stage == SOLVED and answer.pose is not None]
+        table = {}
+        for method in dict.fromkeys(answer.method for answer in solved):
+            for look in ("first", "final"):
+                pairs, right = [], []
+                for answer in solved:
+                    measured = getattr(answer, f"{look}_uncertainty")
+                    if answer.method == method and measured is not None and answer.pose is not None:
+                        pairs.append(measured)
+                        right.append(answer.pose.symmetric)
+                if pairs:
+                    table[method, look] = summarise_uncertainty(pairs, right)
+        return table
+
     def to_json(self) -> str:
         """Return the whole report as JSON text, one answer a line."""
         rows = [
             {"group": group, "method": method, "stage": stage, **asdict(summary)}
             for (group, method, stage), summary in self.summaries().items()
         ]
-        head = json.dumps(
-            {**self.settings, "quoted": self._quoted(), "summary": rows}, indent=2, allow_nan=False
-        )
+        uncertainty = [
+            {"method": method, "look": look, **asdict(summary)}
+            for (method, look), summary in self.uncertainties().items()
+        ]
+        found = {"quoted": self._quoted(), "summary": rows, "uncertainty": uncertainty}
+        head = json.dumps({**self.settings, **found}, indent=2, allow_nan=False)
         lines = ",\n    ".join(json.dumps(answer.to_dict(), allow_nan=False) for answer in self.answers)
         return f'{head[:-2]},\n  "answers": [\n    {lines}\n  ]\n}}\n'
 
@@ -93,6 +113,8 @@ def render(report: Report, console: Console) -> None:
     if report.quoted_rows():
         console.print(_paper(report))
     console.print(_matches(report))
+    if report.uncertainties():
+        console.print(_uncertainty(report))
     lost = [(a.method, a.message) for a in report.answers if a.message]
     for method, message in sorted(set(lost)):
         count = lost.count((method, message))
@@ -187,6 +209,25 @@ def _matches(report: Report) -> Table:
             *(_number(row.cpu_seconds.get(step), "{:.2f}") for step in ("look", "solve", "refine")),
         )
         previous = group
+    return table
+
+
+def _uncertainty(report: Report) -> Table:
+    from rich.table import Table
+
+    table = Table(
+        title="Raw uncertainty (variance of the sampled overlap) by place and by pair",
+        caption="border: of the overlap; plain, rich: the quarters of its inside with the least and the most "
+        "relief; AUC: probability that the former is more uncertain than the latter",
+    )
+    headings = ("border", "inside", "outside", "plain", "rich", "AUC\nborder, inside", "AUC\nplain, rich")
+    for heading in ("method", "look"):
+        table.add_column(heading)
+    for heading in (*headings, "pairs\nthat fail", "others", "AUC\nfailing pairs"):
+        table.add_column(heading, justify="right")
+    for (method, look), row in report.uncertainties().items():
+        values = (*row.places.values(), row.border_auc, row.plain_auc, row.failed, row.right, row.failed_auc)
+        table.add_row(method, look, *(_number(value, "{:.3f}") for value in values))
     return table
 
 

@@ -42,6 +42,41 @@ class UncertaintyByPlace:
     plain_auc: float | None
 
 
+@dataclass(frozen=True)
+class UncertaintySummary:
+    """Raw uncertainty of one method over many pairs.
+
+    Attributes:
+        places: mean over pairs of the mean by place of ``PLACES``; None where no pair has such nodes.
+        border_auc: mean over pairs; see ``UncertaintyByPlace``.
+        plain_auc: likewise.
+        failed: mean over the pairs whose answer is wrong; None without such a pair.
+        right: mean over the others.
+        failed_auc: probability that a pair that fails is more uncertain than one that doesn't.
+    """
+
+    places: dict[str, float | None]
+    border_auc: float | None
+    plain_auc: float | None
+    failed: float | None
+    right: float | None
+    failed_auc: float | None
+
+
+def summarise_uncertainty(pairs: Sequence[UncertaintyByPlace], right: Sequence[bool]) -> UncertaintySummary:
+    """Summarise pairs, of which ``right`` tells whether their answer is."""
+    means = np.array([pair.mean for pair in pairs])
+    good = np.array(right, dtype=bool)
+    return UncertaintySummary(
+        {place: _mean([pair.places[place] for pair in pairs]) for place in PLACES},
+        _mean([pair.border_auc for pair in pairs]),
+        _mean([pair.plain_auc for pair in pairs]),
+        _mean(means[~good].tolist()),
+        _mean(means[good].tolist()),
+        area_under_curve(means[~good], means[good]),
+    )
+
+
 def measure_uncertainty(
     prepared: PreparedPair, view: NetworkView, source_overlap: np.ndarray, target_overlap: np.ndarray
 ) -> UncertaintyByPlace:
@@ -99,6 +134,11 @@ def area_under_curve(
         return None
     below = np.searchsorted(low, high, side="left") + np.searchsorted(low, high, side="right")
     return float(below.mean() / (2.0 * len(low)))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _at_border(points: np.ndarray, overlap: np.ndarray, reach: float) -> np.ndarray:
