@@ -34,7 +34,7 @@ UNIT_MISMATCH = 8.0
 FEWEST_NODES = 50
 """The network sees at least this many points of a scan that has them."""
 
-CLEAR_SCORE = 0.15
+CLEAR_SCORE = 0.25
 """An estimate that scores less may rest on normals whose sides were guessed differently."""
 
 CLEAR_OUTWARDNESS = 0.1
@@ -209,7 +209,7 @@ def _check_options(options: AlignOptions, initial: np.ndarray | None) -> None:
 def _sides_in_doubt(prepared: PreparedPair, estimate: Estimate) -> bool:
     """Tell whether the two scans may have been given normals on opposite sides."""
     sheet = min(prepared.source.outwardness, prepared.target.outwardness) < CLEAR_OUTWARDNESS
-    return sheet or estimate.score < CLEAR_SCORE
+    return not estimate.shared_points and (sheet or estimate.score < CLEAR_SCORE)
 
 
 def _better_side(
@@ -228,7 +228,7 @@ def _better_side(
     reversed_pair = replace(prepared, source=prepared.source.turned_inside_out())
     reversed_view = predict(model, reversed_pair, options.seed)
     other = _solve(reversed_pair, reversed_view, options.solver, initial)
-    if other.score > estimate.score:
+    if other.outranks(estimate):
         return reversed_pair, reversed_view, other
     return prepared, view, estimate
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.estimation.conftest import VOXEL
+from tests.estimation.conftest import VOXEL, lumpy_surface
 from utopic_cli.estimation.surface import DepthMap, make_surface, point_spacing, thinned
 from utopic_cli.estimation.verification import measure_fit, verify
 from utopic_cli.geometry import rigid
@@ -114,3 +114,22 @@ def test_measure_fit_refuses_nonsense() -> None:
         measure_fit(sheet(0.0), sheet(0.0), np.eye(4), 0.0, 0.0)
     with pytest.raises(ValueError, match="empty"):
         measure_fit(PointCloud(np.zeros((0, 3))), sheet(0.0), np.eye(4), 0.1, 0.0)
+
+
+def test_a_sparse_sample_lies_on_the_surface_of_another_one(gt_transformation: np.ndarray) -> None:
+    # Points of two sparse samples are nearly a spacing apart; their tangent planes are not.
+    rng = np.random.default_rng(4)
+    whole = lumpy_surface(40_000, 0.0)
+    assert whole.normals is not None
+    rows = rng.permutation(len(whole))
+    first, second = (
+        PointCloud(whole.points[each], whole.normals[each]) for each in (rows[:700], rows[-700:])
+    )
+    spacing = 1.2 * point_spacing(first.points)
+    source, target = (
+        make_surface(first, spacing),
+        make_surface(second.transformed(gt_transformation), spacing),
+    )
+    others = [rigid.rigid(rigid.random_rotation(rng), gt_transformation[:3, 3]) for _ in range(20)]
+    verdict = verify(source, target, np.stack([gt_transformation, *others]))
+    assert verdict.fit[0] > 0.6 and verdict.fit[0] > 2 * verdict.fit[1:].max()

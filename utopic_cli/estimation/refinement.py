@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from utopic_cli.estimation.partners import BEYOND_CHANCE, fit_partners, partner_evidence, partner_reach
 from utopic_cli.estimation.surface import Surface, point_spacing, thinned
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.normals import estimate_normals
@@ -14,6 +15,9 @@ from utopic_cli.point_cloud import PointCloud
 
 SURFACE_NEIGHBOURS = 20
 ITERATIONS = 12
+MOST_PARTNERS = 5_000
+"""Clouds of more points than this are not asked whether they share points: dense surfaces fix a
+pose as well."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,9 @@ def refine(
     Symmetric point-to-plane ICP: distances are measured along the mean of both normals. The
     search radius shrinks from ``radius`` to a few times the points' own spacing, following the
     spread of the residuals; partners that lie beside the target's border (far along the
-    surface) are dropped, so that parts seen by one scan only do not pull.
+    surface) are dropped, so that parts seen by one scan only do not pull. Where small clouds
+    turn out to share points (see ``partners``), a fit to those follows: planes through noisy
+    points would only spoil it.
 
     Args:
         source: (N, 3) all points of the scan that moves; its normals are not needed.
@@ -167,7 +173,8 @@ def refine(
         limit: most points used of each scan; larger ones are thinned evenly.
 
     Returns:
-        The better of the refined and the given transformation, with its residual.
+        The better of the refined and the given transformation, with its residual; for clouds
+        that share points, the fit to those, whatever its residual.
 
     Raises:
         ValueError: fewer than six points, points that all coincide, or ``T`` is not rigid.
@@ -192,6 +199,9 @@ def refine(
     threshold = max(finest, min(radius, 2.0 * finest) if radius is not None else 2.0 * finest)
     before = _residual(moving, fixed, T, threshold)
     after = _residual(moving, fixed, current, threshold)
+    fitted = _fit_partners(moving, fixed, np.stack([T, current]))
+    if fitted is not None:
+        return Refinement(fitted, _residual(moving, fixed, fitted, threshold), before, True, threshold)
     improved = bool(after < before)
     return Refinement(current if improved else T, min(after, before), before, improved, threshold)
 
@@ -204,6 +214,21 @@ class _FullSurface:
         self.tree = cKDTree(points)
         self.spacing = point_spacing(points, self.tree)
         self.normals = estimate_normals(points, SURFACE_NEIGHBOURS)
+
+
+def _fit_partners(
+    moving: _FullSurface, fixed: _FullSurface, transformations: np.ndarray
+) -> np.ndarray | None:
+    """Fit to shared points from the best of (H, 4, 4) transformations; None if there are none."""
+    if max(len(moving.points), len(fixed.points)) > MOST_PARTNERS:
+        return None
+    reach = partner_reach(moving.points, fixed.points)
+    if not reach > 0:
+        return None
+    evidence = partner_evidence(moving.points, fixed.points, transformations, reach)
+    if not evidence.max() > BEYOND_CHANCE:
+        return None
+    return fit_partners(moving.points, fixed.points, transformations[evidence.argmax()], reach)
 
 
 def _descend(moving: _FullSurface, fixed: _FullSurface, T: np.ndarray, reach: float) -> np.ndarray:

@@ -12,6 +12,13 @@ from utopic_cli.estimation.correspondences import (
     linear_assignment,
     overlap_weights,
 )
+from utopic_cli.estimation.partners import (
+    BEYOND_CHANCE,
+    approach_partners,
+    fit_partners,
+    partner_evidence,
+    partner_reach,
+)
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.refinement import Stage, refine_coarse
 from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
@@ -26,7 +33,9 @@ MERGE_DISTANCE = 8.0  # voxels
 PROPOSED = 200
 FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
-REFINED = 30
+REFINED = 8  # measured: what ranks lower after screening never turns out best
+REFINED_SPARSE = 30  # partners may yet speak for it
+APPROACHED = 3
 RIVALS = 5
 SCREENING = (Stage(5.0, 6, 250), Stage(3.0, 4, 250))
 COARSE = (Stage(3.0, 8, 1000), Stage(1.2, 8, 1000))
@@ -98,6 +107,8 @@ class Estimate:
         support: share of the candidates' weight that the answer explains.
         method: ``svd`` or ``consensus``, and for ``auto`` where the answer came from:
             ``assignment``, ``consensus`` or ``initial``.
+        shared_points: whether the clouds turned out to share points, and the answer rests on
+            them: stronger evidence than any score.
     """
 
     T_target_source: np.ndarray
@@ -109,6 +120,11 @@ class Estimate:
     correspondences: Correspondences
     support: float
     method: str
+    shared_points: bool = False
+
+    def outranks(self, other: Estimate) -> bool:
+        """Tell whether more speaks for this estimate than for another one of the same scans."""
+        return (self.shared_points, self.score) > (other.shared_points, other.score)
 
 
 def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = None) -> Estimate:
@@ -144,11 +160,15 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
         hypotheses += _consensus(problem, candidates, source, target, voxel)
     if not hypotheses:
         raise ValueError("no transformation follows from the matching scores")
-    tried = hypotheses[:FIRST]
-    chosen = _refine_and_verify(tried, source, target, refine=solver != "svd")
-    if chosen[0].score < BEYOND_DOUBT and len(hypotheses) > FIRST:
-        tried = hypotheses
-        chosen = _refine_and_verify(tried, source, target, refine=True)
+    refine = solver != "svd"
+    tried = min(FIRST, len(hypotheses))
+    screened = _screened(hypotheses[:tried], source, target, refine=refine)
+    chosen, partners = _refined(problem, screened, source, target, refine=refine)
+    if not partners and chosen[0].score < BEYOND_DOUBT and tried < len(hypotheses):
+        screened += _screened(hypotheses[tried:], source, target, refine=refine)
+        tried = len(hypotheses)
+        chosen, partners = _refined(problem, screened, source, target, refine=refine)
+    chosen = partners or chosen
     best = chosen[0]
     if solver == "svd" and best.origin == "assignment":
         correspondences = _assignment(problem)
@@ -163,10 +183,11 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
         fit=best.fit,
         violation=best.violation,
         rivals=tuple(chosen[1 : RIVALS + 1]),
-        hypotheses=len(tried),
+        hypotheses=tried,
         correspondences=correspondences if solver == "svd" else explained,
         support=support,
         method=best.origin if solver == "auto" else solver,
+        shared_points=bool(partners),
     )
 
 
@@ -253,24 +274,48 @@ def _consensus(
     )
 
 
-def _refine_and_verify(
+def _screened(
     hypotheses: list[Hypothesis], source: Surface, target: Surface, *, refine: bool
-) -> list[Candidate]:
-    """Refine and score every hypothesis; return the distinct ones, best first."""
+) -> list[Hypothesis]:
+    """Draw each hypothesis into the nearest fit with few points; its score becomes that fit's."""
     transformations = np.stack([hypothesis.T_target_source for hypothesis in hypotheses])
-    origins = np.array([hypothesis.origin for hypothesis in hypotheses])
-    centre = source.points.mean(axis=0)
-    apart = MERGE_DISTANCE * target.voxel
     if refine:
         transformations = refine_coarse(source, target, transformations, SCREENING)
-        quick = verify(source, target, transformations, samples=500, close=1.5, agreeing=0.7)
-        order = np.argsort(-quick.score, kind="stable")
-        order = order[distinct(transformations[order], centre, apart / 4, 2.5)][:REFINED]
-        transformations = refine_coarse(source, target, transformations[order], COARSE)
-        origins = origins[order]
+    score = verify(source, target, transformations, samples=500).score
+    return [
+        Hypothesis(T, float(quick), hypothesis.origin)
+        for T, quick, hypothesis in zip(transformations, score, hypotheses, strict=True)
+    ]
+
+
+def _refined(
+    problem: Problem, screened: list[Hypothesis], source: Surface, target: Surface, *, refine: bool
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Refine and verify the best of the screened hypotheses.
+
+    Returns:
+        The distinct candidates, best first, and those of them whose points have partners.
+    """
+    screened = sorted(screened, key=lambda hypothesis: -hypothesis.score)
+    transformations = np.stack([hypothesis.T_target_source for hypothesis in screened])
+    centre = source.points.mean(axis=0)
+    apart = MERGE_DISTANCE * target.voxel
+    most = REFINED_SPARSE if _nodes_are_points(problem) else REFINED
+    kept = distinct(transformations, centre, apart / 4, 2.5)[:most]
+    transformations, origins = transformations[kept], np.array([screened[i].origin for i in kept])
+    if refine:
+        transformations = refine_coarse(source, target, transformations, COARSE)
+    candidates = _verified(transformations, origins, source, target)
+    kept = distinct(np.stack([candidate.T_target_source for candidate in candidates]), centre, apart)
+    candidates = [candidates[i] for i in kept]
+    return candidates, _with_partners(problem, candidates, source, target) if refine else []
+
+
+def _verified(
+    transformations: np.ndarray, origins: np.ndarray, source: Surface, target: Surface
+) -> list[Candidate]:
+    """Score (H, 4, 4) transformations; best first."""
     verdict = verify(source, target, transformations)
-    order = np.argsort(-verdict.score, kind="stable")
-    order = order[distinct(transformations[order], centre, apart)]
     return [
         Candidate(
             rigid.rigid(rigid.nearest_rotation(transformations[i, :3, :3]), transformations[i, :3, 3]),
@@ -279,7 +324,38 @@ def _refine_and_verify(
             float(verdict.violation[i]),
             str(origins[i]),
         )
-        for i in order
+        for i in np.argsort(-verdict.score, kind="stable")
+    ]
+
+
+def _nodes_are_points(problem: Problem) -> bool:
+    """Tell sparse clouds, used whole, from dense scans, whose nodes are means of many points."""
+    return len(problem.source_nodes) >= len(problem.source_dense) and (
+        len(problem.target_nodes) >= len(problem.target_dense)
+    )
+
+
+def _with_partners(
+    problem: Problem, candidates: list[Candidate], source: Surface, target: Surface
+) -> list[Candidate]:
+    """Return the candidates under which the clouds turn out to share points, refitted to them.
+
+    Usually none is left, and the surfaces decide. Where some are, the coincidence of single
+    points is the stronger witness: it tells even symmetric poses apart.
+    """
+    nodes = problem.source_nodes, problem.target_nodes
+    reach = partner_reach(*nodes) if _nodes_are_points(problem) else 0.0
+    if not reach > 0:
+        return []
+    evidence = partner_evidence(*nodes, np.stack([each.T_target_source for each in candidates]), reach)
+    candidates = [candidates[i] for i in np.argsort(-evidence, kind="stable")[:APPROACHED]]
+    approached = np.stack([approach_partners(*nodes, each.T_target_source, reach) for each in candidates])
+    evidence = partner_evidence(*nodes, approached, reach)
+    order = [i for i in np.argsort(-evidence, kind="stable") if evidence[i] > BEYOND_CHANCE]
+    fitted = [fit_partners(*nodes, approached[i], reach) for i in order]
+    return [
+        _verified(T[None], np.array([candidates[i].origin]), source, target)[0]
+        for i, T in zip(order, fitted, strict=True)
     ]
 
 

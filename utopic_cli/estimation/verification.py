@@ -12,8 +12,9 @@ from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import FitMeasures
 
-CLOSE = 0.5  # voxels; measured to pick the right one more often than 0.75
-AGREEING = 0.85  # cosine of the angle between normals
+REACH = 2.0  # voxels to the nearest point: in a sparse cloud it is rarely nearer than one
+CLOSE = 0.3  # voxels beside that point's tangent plane: what tells surfaces apart, however sparse
+AGREEING = 0.7  # cosine of the angle between normals
 FREE_SPACE_MARGIN = 1.5  # voxels
 
 
@@ -22,7 +23,8 @@ class Verdict:
     """What speaks for and against H transformations.
 
     Attributes:
-        fit: (H,) share of points with a close neighbour and agreeing normals, mean of both ways.
+        fit: (H,) share of points that lie on the other scan's surface (in the tangent plane of
+            a near neighbour whose normal agrees), mean of both ways.
         violation: (H,) share of points that stand where the other scan saw empty space, mean
             of both ways.
         score: (H,) ``fit - violation``.
@@ -39,47 +41,47 @@ def verify(
     transformations: np.ndarray,
     *,
     samples: int = 1000,
-    close: float = CLOSE,
-    agreeing: float = AGREEING,
 ) -> Verdict:
     """Score H transformations by fit, both ways, minus free-space violation.
 
-    A wrong transformation can lay two surfaces on each other over a good part; it then
-    nearly always puts some of one scan in front of what the other scan saw, which a right
-    one never does.
+    Two samples of one surface share no points, so what is asked of a point is to lie in the
+    tangent plane of its nearest neighbour, not on the neighbour itself. A wrong transformation
+    can lay two surfaces on each other over a good part; it then nearly always puts some of one
+    scan in front of what the other scan saw, which a right one never does.
 
     Args:
         source: the scan that moves.
         target: the scan that stays.
         transformations: (H, 4, 4) T_target_source.
         samples: points of each scan looked at.
-        close: largest distance to the nearest neighbour, in voxels.
-        agreeing: smallest cosine between the two oriented normals.
     """
     inverse_rotations = transformations[:, :3, :3].transpose(0, 2, 1)
     inverse = np.zeros_like(transformations)
     inverse[:, :3, :3] = inverse_rotations
     inverse[:, :3, 3] = -np.einsum("hij,hj->hi", inverse_rotations, transformations[:, :3, 3])
     inverse[:, 3, 3] = 1.0
-    forward_fit, forward_violation = _one_way(source, target, transformations, samples, close, agreeing)
-    backward_fit, backward_violation = _one_way(target, source, inverse, samples, close, agreeing)
+    forward_fit, forward_violation = _one_way(source, target, transformations, samples)
+    backward_fit, backward_violation = _one_way(target, source, inverse, samples)
     fit = (forward_fit + backward_fit) / 2.0
     violation = (forward_violation + backward_violation) / 2.0
     return Verdict(fit, violation, fit - violation)
 
 
 def _one_way(
-    moving: Surface, fixed: Surface, transformations: np.ndarray, samples: int, close: float, agreeing: float
+    moving: Surface, fixed: Surface, transformations: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit and violation (H,) of the moving scan's points against the fixed scan."""
     chosen = moving.sample[:: max(1, len(moving.sample) // samples)]
     rotations = transformations[:, :3, :3].transpose(0, 2, 1)
     moved = moving.points[chosen] @ rotations + transformations[:, None, :3, 3]  # (H, S, 3)
     turned = moving.normals[chosen] @ rotations
-    distance, index = fixed.tree.query(moved, distance_upper_bound=close * fixed.voxel)
+    distance, index = fixed.tree.query(moved, distance_upper_bound=REACH * fixed.voxel)
     found = np.isfinite(distance)
-    agreement = np.einsum("hsd,hsd->hs", turned, fixed.normals[np.where(found, index, 0)])
-    fit = (found & (agreement > agreeing)).mean(axis=1)
+    index = np.where(found, index, 0)
+    plane = fixed.normals[index]
+    beside = np.abs(np.einsum("hsd,hsd->hs", fixed.points[index] - moved, plane))
+    agreement = np.einsum("hsd,hsd->hs", turned, plane)
+    fit = (found & (beside < CLOSE * fixed.voxel) & (agreement > AGREEING)).mean(axis=1)
     violation = fixed.depth_map.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean(axis=1)
     return fit, violation
 

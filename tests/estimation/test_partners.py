@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.estimation.conftest import lumpy_surface
+from utopic_cli.estimation.partners import (
+    BEYOND_CHANCE,
+    approach_partners,
+    fit_partners,
+    partner_evidence,
+    partner_reach,
+)
+from utopic_cli.estimation.procrustes import weighted_procrustes
+from utopic_cli.estimation.refinement import refine
+from utopic_cli.estimation.solver import Problem, solve
+from utopic_cli.geometry import rigid
+from utopic_cli.geometry.normals import estimate_normals, orient_normals
+from utopic_cli.point_cloud import PointCloud
+
+JITTER = 0.007
+
+
+def random_sample(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw points of the blob at random, as samples of a mesh are."""
+    points = lumpy_surface(40 * count, 0.2).points
+    return points[rng.permutation(len(points))[:count]]
+
+
+def crop(points: np.ndarray, direction: tuple[float, float, float]) -> np.ndarray:
+    """Rows of the 70 % of the points that lie farthest along a direction."""
+    return np.argsort(-(points @ np.array(direction)))[: int(0.7 * len(points))]
+
+
+@pytest.fixture(scope="module")
+def shared(gt_transformation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two crops of one sample, each with jitter of its own, and the true partners (K, 2)."""
+    rng = np.random.default_rng(0)
+    whole = random_sample(1000, rng)
+    rows = crop(whole, (1.0, 0.2, 0.0)), crop(whole, (0.3, 1.0, 0.5))
+    source, target = (whole[each] + rng.normal(0, JITTER, (len(each), 3)) for each in rows)
+    _, first, second = np.intersect1d(*rows, return_indices=True)
+    return source, rigid.apply(gt_transformation, target), np.column_stack([first, second])
+
+
+def nudged(T: np.ndarray, points: np.ndarray, degrees: float, shift: float) -> np.ndarray:
+    centre = rigid.apply(T, points.mean(axis=0))
+    turn = rigid.rotation_from_vector(np.radians(degrees) * np.array([0.6, -0.64, 0.48]))
+    return rigid.rigid(turn, centre - turn @ centre + shift * np.array([0.6, 0.0, 0.8])) @ T
+
+
+def test_shared_points_are_told_from_samples_of_their_own(
+    shared: tuple[np.ndarray, np.ndarray, np.ndarray], gt_transformation: np.ndarray
+) -> None:
+    source, target, _ = shared
+    turned = nudged(gt_transformation, source, 90.0, 0.0)
+    poses = np.stack([gt_transformation, turned])
+    at_the_truth, elsewhere = partner_evidence(source, target, poses, partner_reach(source, target))
+    assert at_the_truth > 1.5 * BEYOND_CHANCE and elsewhere < 0
+    rng = np.random.default_rng(1)
+    other = rigid.apply(gt_transformation, random_sample(1000, rng))
+    poses = np.stack(
+        [gt_transformation, approach_partners(source, other, gt_transformation, partner_reach(source, other))]
+    )
+    assert partner_evidence(source, other, poses, partner_reach(source, other)).max() < 0
+
+
+def test_grids_do_not_pass_for_shared_points() -> None:
+    axis = np.arange(20) * 0.1
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    flat = np.column_stack([grid, np.zeros(len(grid))])
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        turn = rigid.rotation_from_vector(np.array([0.0, 0.0, rng.uniform(0.2, 1.3)]))
+        pose = rigid.rigid(turn, np.append(rng.uniform(0, 1, 2), 0.0))
+        assert partner_evidence(flat, flat, pose[None], partner_reach(flat, flat))[0] < BEYOND_CHANCE
+
+
+def test_nothing_near_is_no_evidence() -> None:
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    far = rigid.rigid(np.eye(3), np.full(3, 50.0))
+    assert partner_evidence(points, points, far[None], 0.1)[0] == -np.inf
+    assert np.array_equal(approach_partners(points, points, far, 0.1), far)
+    assert np.array_equal(fit_partners(points, points, far, 0.1), far)
+
+
+def test_the_fit_is_nearly_as_good_as_if_the_partners_were_known(
+    shared: tuple[np.ndarray, np.ndarray, np.ndarray], gt_transformation: np.ndarray
+) -> None:
+    source, target, pairs = shared
+    known = weighted_procrustes(source[pairs[:, 0]], target[pairs[:, 1]], np.ones(len(pairs)))
+    start = nudged(gt_transformation, source, 1.5, 0.01)
+    found = fit_partners(source, target, start, partner_reach(source, target))
+    floor = rigid.relative_rotation_error_deg(known, gt_transformation)
+    assert rigid.relative_rotation_error_deg(found, gt_transformation) < 1.3 * floor + 0.1
+    assert rigid.relative_rotation_error_deg(found, known) < 0.25
+    assert rigid.is_rigid(found, 1e-9)
+
+
+def test_exact_copies_are_aligned_exactly(gt_transformation: np.ndarray) -> None:
+    source = random_sample(300, np.random.default_rng(2))
+    target = rigid.apply(gt_transformation, source)[::-1]
+    found = fit_partners(
+        source, target, nudged(gt_transformation, source, 1.0, 0.005), partner_reach(source, target)
+    )
+    assert np.abs(found - gt_transformation).max() < 1e-6
+
+
+def test_refine_leaves_shared_points_on_their_partners(
+    shared: tuple[np.ndarray, np.ndarray, np.ndarray], gt_transformation: np.ndarray
+) -> None:
+    source, target, pairs = shared
+    known = weighted_procrustes(source[pairs[:, 0]], target[pairs[:, 1]], np.ones(len(pairs)))
+    refined = refine(PointCloud(source), PointCloud(target), nudged(gt_transformation, source, 2.0, 0.01))
+    assert rigid.relative_rotation_error_deg(refined.T_target_source, known) < 0.25
+
+
+def surface_of(points: np.ndarray) -> PointCloud:
+    return PointCloud(points, orient_normals(points, estimate_normals(points, 12)))
+
+
+def test_shared_points_tell_symmetric_poses_apart(gt_transformation: np.ndarray) -> None:
+    # A box looks the same after half a turn; its sampled points do not. The scores favour
+    # the wrong pose.
+    rng = np.random.default_rng(3)
+    faces = rng.integers(0, 3, 700)
+    box = rng.uniform(-1.0, 1.0, (700, 3))
+    box[np.arange(700), faces] = np.where(rng.random(700) < 0.5, -1.0, 1.0)
+    box *= [0.5, 0.35, 0.2]
+    source = box + rng.normal(0, 0.004, box.shape)
+    target = rigid.apply(gt_transformation, box + rng.normal(0, 0.004, box.shape))
+    half_turn = box @ np.diag([1.0, -1.0, -1.0])
+    scores = np.zeros((700, 700))
+    for points, score in ((box, 0.3), (half_turn, 0.5)):
+        gap = np.linalg.norm(points[:, None] - box, axis=2)
+        scores[np.arange(700), gap.argmin(axis=1)] += score
+    problem = Problem(
+        source_nodes=source,
+        target_nodes=target,
+        matching_scores=scores,
+        source_overlap=np.ones(700),
+        target_overlap=np.ones(700),
+        source_certainty=np.ones(700),
+        target_certainty=np.ones(700),
+        source_dense=surface_of(source),
+        target_dense=surface_of(target),
+        spacing=0.1,
+    )
+    estimate = solve(problem)
+    assert rigid.relative_rotation_error_deg(estimate.T_target_source, gt_transformation) < 0.3
+    assert not estimate.rivals
+    # Without points of their own for nodes, the clouds' surfaces decide, and can't.
+    few = replace(
+        problem,
+        source_nodes=source[::2],
+        target_nodes=target[::2],
+        matching_scores=scores[::2, ::2],
+        source_overlap=np.ones(350),
+        target_overlap=np.ones(350),
+        source_certainty=np.ones(350),
+        target_certainty=np.ones(350),
+    )
+    surfaces = solve(few)
+    half = surfaces.rivals[0].T_target_source if surfaces.rivals else surfaces.T_target_source
+    turned = rigid.rotation_angle_deg(half[:3, :3] @ surfaces.T_target_source[:3, :3].T)
+    assert surfaces.rivals and turned == pytest.approx(180.0, abs=3.0)
