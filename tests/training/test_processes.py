@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from tests.model.conftest import SMALL
+from utopic_cli.bridge import cpu_threads
 from utopic_cli.config import ModelConfig
 from utopic_cli.errors import InputError
 from utopic_cli.synthesis.pairs import PairSettings
@@ -81,13 +82,16 @@ def test_gradients_of_two_processes_agree_with_those_of_one(tmp_path, stage):
     code = f"from tests.training.test_processes import _share; _share({stage!r}, {str(tmp_path)!r})"
     for done in start_two(["-c", code]):
         assert done.returncode == 0, done.stderr
-    alone = gradients((0, 1), Processes(), stage)
+    with cpu_threads(1):  # as the two have: the order of sums is a matter of threads
+        alone = gradients((0, 1), Processes(), stage)
     for rank in range(2):
         answer = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
         assert answer["stopped"]  # one process' wish to stop is everybody's
         assert all(not grad.any() for name, grad in answer["gradients"].items() if name not in alone)
         for name, gradient in alone.items():
-            torch.testing.assert_close(answer["gradients"][name], gradient, atol=2e-5, rtol=1e-3, msg=name)
+            # By norm: single float32 entries hang on which of two nearly equal maxima is the larger.
+            difference = (answer["gradients"][name] - gradient).norm()
+            assert difference < 2e-3 * gradient.norm() + 1e-5, name
 
 
 def test_the_command_trains_in_two_processes(tmp_path):
