@@ -24,14 +24,16 @@ def clouds() -> tuple[PointCloud, PointCloud, np.ndarray]:
     return PointCloud(source.points[::2]), PointCloud(target.points[1::2]), gt
 
 
-def test_a_network_is_solved_for_exactly_as_the_pipeline_does(clouds) -> None:
+def test_a_network_is_solved_for_as_the_pipeline_does(clouds) -> None:
     source, target, _ = clouds
     (network,) = load_matchers(["utopic"], [], seed=3, device="cpu")
     prepared = prepare(source, target, 300)
     look = solve_pair(prepared, network.look(prepared), network)
     options = AlignOptions(points=300, refine=False, seed=3, device="cpu")
     expected = register(source, target, options).T_target_source
-    np.testing.assert_array_equal(look.prepared.denormalise(look.estimate.T_target_source), expected)
+    found = look.prepared.denormalise(look.estimate.T_target_source)
+    # The same steps; where arrays happen to lie in memory can change the last bits of a sum.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 def test_fpfh_aligns_two_parts_of_an_object(clouds) -> None:
