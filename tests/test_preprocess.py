@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from tests.model.conftest import bumpy_points
 from utopic_cli.geometry import rigid
+from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PATCHES, carry_to_all, prepare, sample
 
@@ -109,3 +111,63 @@ def test_values_carried_to_all_points_interpolate_and_keep_their_range():
     assert (carried[points[:, 0] > 0.5, 0] > 0.5).mean() > 0.98
     at_nodes = carry_to_all(nodes, nodes, values)
     np.testing.assert_allclose(at_nodes, values, atol=1e-5)
+
+
+def test_another_sampling_shows_the_same_surface_through_other_points():
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((20_000, 3)) * [1.0, 0.7, 0.4]
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    clouds = PointCloud(points), PointCloud(points[::2])
+    first = prepare(*clouds, 300)
+    anew = prepare(*clouds, 300, resampled=np.random.default_rng(1))
+    assert (anew.scale, anew.spacing) == (first.scale, first.spacing)  # one frame for both
+    for one, other in ((first.source, anew.source), (first.target, anew.target)):
+        assert abs(len(one.points) - len(other.points)) < 0.2 * len(one.points)
+        apart, _ = cKDTree(one.points).query(other.points)
+        assert 0.1 * first.spacing < np.median(apart) < first.spacing
+        on_surface, index = cKDTree(one.dense.points).query(other.dense.points)
+        assert on_surface.max() < first.spacing
+        agreement = np.einsum("nd,nd->n", one.dense.normals[index], other.dense.normals)
+        assert np.median(agreement) > 0.99
+    again = prepare(*clouds, 300, resampled=np.random.default_rng(1))
+    assert np.array_equal(again.source.points, anew.source.points)
+
+
+def test_a_turned_sample_is_turned_throughout():
+    rng = np.random.default_rng(0)
+    cloud = sample(rng.standard_normal((4000, 3)), 0.3, 500)
+    rotation = random_rotation(rng)
+    turned = cloud.rotated(rotation)
+    np.testing.assert_allclose(turned.points, cloud.points @ rotation.T)
+    np.testing.assert_allclose(turned.normals, cloud.normals @ rotation.T)
+    np.testing.assert_allclose(turned.patches[0][..., 3:], cloud.patches[0][..., 3:] @ rotation.T, atol=1e-6)
+    for mine, theirs in zip(turned.patches, cloud.patches, strict=True):
+        assert mine.dtype == np.float32
+        np.testing.assert_allclose(
+            np.linalg.norm(mine[..., :3], axis=-1), np.linalg.norm(theirs[..., :3], axis=-1), atol=1e-5
+        )
+
+
+def test_sparse_clouds_are_sampled_anew_by_leaving_points_out():
+    points = np.random.default_rng(0).standard_normal((500, 3))
+    anew = prepare(PointCloud(points), PointCloud(points), 1000, resampled=np.random.default_rng(1))
+    assert len(anew.source.points) == len(anew.target.points) == 450
+    assert set(map(tuple, anew.source.points.round(9))) != set(map(tuple, anew.target.points.round(9)))
+
+
+def test_many_scattered_points_are_left_out_of_the_sampling():
+    rng = np.random.default_rng(0)
+    ball = rng.standard_normal((6000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    air = rng.uniform(-2, 2, (1500, 3))
+    dirty = PointCloud(np.concatenate([ball, air[np.abs(np.linalg.norm(air, axis=1) - 1) > 0.3]]))
+    radius = {}
+    for clean in (False, True):
+        pair = prepare(dirty, dirty, 300, clean=clean)
+        nodes = pair.source.points * pair.scale + pair.source_centre
+        radius[clean] = np.linalg.norm(nodes, axis=1)
+    in_the_air = {clean: (np.abs(found - 1.0) > 0.2).mean() for clean, found in radius.items()}
+    assert in_the_air[True] < 0.4 * in_the_air[False]
+    few = PointCloud(np.concatenate([ball, air[:60]]))
+    pairs = [prepare(few, few, 300, clean=clean) for clean in (False, True)]
+    assert np.array_equal(pairs[0].source.points, pairs[1].source.points)  # a few do no harm

@@ -15,6 +15,8 @@ from scipy.spatial import cKDTree
 
 from utopic_cli.errors import InputError
 from utopic_cli.geometry.normals import estimate_normals, orient_normals, orient_towards
+from utopic_cli.geometry.outliers import scattered
+from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.geometry.voxel import cell_means, voxel_downsample, voxel_index
 from utopic_cli.point_cloud import PointCloud
 
@@ -29,6 +31,9 @@ DENSE_RATIO = 2.2
 
 FEWEST_DENSE_POINTS = 30
 """A scan that shrinks to fewer points than this at the pair's common spacing can't be aligned."""
+
+MOST_SCATTERED = 0.02
+"""Share of scattered points that does no harm: the network has seen as many in training."""
 
 MOST_POINTS = 400_000
 """A larger cloud is thinned evenly to about this many points before anything else."""
@@ -61,6 +66,17 @@ class SampledCloud:
         patches = tuple(np.concatenate([patch[..., :3], -patch[..., 3:]], axis=2) for patch in self.patches)
         dense = PointCloud(self.dense.points, -_normals_of(self.dense))
         return replace(self, normals=-self.normals, patches=patches, dense=dense)
+
+    def rotated(self, rotation: np.ndarray) -> SampledCloud:
+        """Return the cloud turned about the origin by a (3, 3) rotation."""
+        halves = ((patch[..., :3] @ rotation.T, patch[..., 3:] @ rotation.T) for patch in self.patches)
+        return replace(
+            self,
+            points=self.points @ rotation.T,
+            normals=self.normals @ rotation.T,
+            patches=tuple(np.concatenate(pair, axis=2).astype(np.float32) for pair in halves),
+            dense=PointCloud(self.dense.points @ rotation.T, _normals_of(self.dense) @ rotation.T),
+        )
 
     @property
     def outwardness(self) -> float:
@@ -116,6 +132,8 @@ def prepare(
     *,
     source_viewpoint: np.ndarray | None = None,
     target_viewpoint: np.ndarray | None = None,
+    clean: bool = False,
+    resampled: np.random.Generator | None = None,
 ) -> PreparedPair:
     """Centre, scale and sample a pair.
 
@@ -126,6 +144,10 @@ def prepare(
         source_viewpoint: (3,) where the scanner stood, in the source's own frame, if known:
             normals then face it, which is faster than propagating signs.
         target_viewpoint: likewise for the target.
+        clean: leave scattered points out of the sampling where a scan has many of them.
+        resampled: draws another sampling of the same scans: turned grids, and of scans so sparse
+            that all their points are sampled, nine in ten. What follows from a sampling alone
+            then differs; what follows from the surfaces stays.
 
     Raises:
         InputError: one scan is so much smaller than the other that nothing of it is left at a
@@ -135,21 +157,32 @@ def prepare(
     centred = [cloud.points - centre for cloud, centre in zip((source, target), centres, strict=True)]
     scale = max(float(np.quantile(np.linalg.norm(part, axis=1), 0.99)) for part in centred)
     thinned = [_thin(part / scale) for part in centred]
+    if clean:
+        thinned = [_without_scattered(part) for part in thinned]
     spacing = _common_spacing(thinned, points)
     viewpoints = [
         None if view is None else (view - centre) / scale
         for view, centre in zip((source_viewpoint, target_viewpoint), centres, strict=True)
     ]
     _check_sizes(thinned, spacing)
+    grids = [None if resampled is None else random_rotation(resampled) for _ in thinned]
+    if resampled is not None:
+        thinned = [_nine_in_ten(part, points, resampled) for part in thinned]
     sampled = [
-        sample(part, spacing, points, viewpoint=view) for part, view in zip(thinned, viewpoints, strict=True)
+        sample(part, spacing, points, viewpoint=view, grid=grid)
+        for part, view, grid in zip(thinned, viewpoints, grids, strict=True)
     ]
     indexed = [_with_node_index(cloud, part / scale) for cloud, part in zip(sampled, centred, strict=True)]
     return PreparedPair(indexed[0], indexed[1], centres[0], centres[1], scale, spacing)
 
 
 def sample(
-    points: np.ndarray, spacing: float, most: int, *, viewpoint: np.ndarray | None = None
+    points: np.ndarray,
+    spacing: float,
+    most: int,
+    *,
+    viewpoint: np.ndarray | None = None,
+    grid: np.ndarray | None = None,
 ) -> SampledCloud:
     """Sample nodes of one normalised cloud and collect the local geometry around them.
 
@@ -158,7 +191,13 @@ def sample(
         spacing: node spacing h.
         most: a cloud of no more points than this keeps every point as a node.
         viewpoint: (3,) scanner position in the same frame, or None.
+        grid: (3, 3) rotation from the points' frame to that of the voxel grids, or None.
     """
+    if grid is not None:
+        aligned = sample(
+            points @ grid.T, spacing, most, viewpoint=None if viewpoint is None else grid @ viewpoint
+        )
+        return aligned.rotated(grid.T)
     dense, _ = voxel_downsample(points, spacing / DENSE_RATIO)
     normals = estimate_normals(dense, neighbours=30, radius=3.0 * spacing / DENSE_RATIO)
     if viewpoint is None:
@@ -194,6 +233,17 @@ def sample(
         dense=PointCloud(dense, normals),
         node_index=np.empty(0, dtype=np.int64),
     )
+
+
+def _without_scattered(points: np.ndarray) -> np.ndarray:
+    alone = scattered(points)
+    return points[~alone] if alone.mean() > MOST_SCATTERED else points
+
+
+def _nine_in_ten(points: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+    if len(points) > most:
+        return points
+    return points[np.sort(rng.permutation(len(points))[: max(FEWEST_DENSE_POINTS, round(0.9 * len(points)))])]
 
 
 def carry_to_all(points: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -59,13 +59,17 @@ def sample_pair(pair: ScanPair, points: int, rng: np.random.Generator) -> Sample
     for the others their signs are found from the points alone, as at inference, with its
     mistakes.
     """
-    views = {}
+    source_viewpoint = target_viewpoint = None
     if rng.random() < 0.5:
-        views = {
-            "source_viewpoint": _far_away(pair.source, pair.source_viewpoint, pair.extent),
-            "target_viewpoint": _far_away(pair.target, pair.target_viewpoint, pair.extent),
-        }
-    prepared = prepare(pair.source, pair.target, points, **views)
+        source_viewpoint = _far_away(pair.source, pair.source_viewpoint, pair.extent)
+        target_viewpoint = _far_away(pair.target, pair.target_viewpoint, pair.extent)
+    prepared = prepare(
+        pair.source,
+        pair.target,
+        points,
+        source_viewpoint=source_viewpoint,
+        target_viewpoint=target_viewpoint,
+    )
     gt = prepared.normalise(pair.gt_T_target_source)
     return SampledPair(prepared, gt, *draw_hypothesis(prepared, gt, rng))
 

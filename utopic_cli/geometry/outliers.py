@@ -1,0 +1,43 @@
+"""Points that belong to no surface: scattered in the air by reflections, dust or mixed pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+NEIGHBOURS = 12
+FAR = 3.0
+"""Scattered points are at least this many times farther from their neighbours than the median point ..."""
+
+THICK = 0.05
+"""... and their neighbourhood is no surface: its smallest principal variance is at least this share of
+all, or the point stands off it. That spares what is merely far from the scanner: sparse, but flat."""
+
+OFF = 0.7
+"""A point stands off its neighbours' plane by at least this share of their root mean square spread."""
+
+
+def scattered(points: np.ndarray) -> np.ndarray:
+    """Tell which points lie on no surface.
+
+    Args:
+        points: (N, 3) in any unit.
+
+    Returns:
+        (N,) bool; nothing is told of fewer than a few dozen points.
+    """
+    if len(points) < 3 * NEIGHBOURS:
+        return np.zeros(len(points), dtype=bool)
+    tree = cKDTree(points)
+    distance, index = tree.query(points, k=NEIGHBOURS + 1, workers=-1)
+    mean = distance[:, 1:].mean(axis=1)
+    far = np.flatnonzero(mean >= FAR * np.median(mean))
+    around = points[index[far, 1:]]  # (F, k, 3)
+    centre = around.mean(axis=1)
+    offset = around - centre[:, None]
+    variance, axes = np.linalg.eigh(np.einsum("fki,fkj->fij", offset, offset) / NEIGHBOURS)
+    height = np.abs(np.einsum("fi,fi->f", points[far] - centre, axes[:, :, 0]))
+    spread = variance.sum(axis=1)
+    alone = np.zeros(len(points), dtype=bool)
+    alone[far] = (variance[:, 0] >= THICK * spread) | (height >= OFF * np.sqrt(spread))
+    return alone
