@@ -174,7 +174,8 @@ def test_a_motion_that_the_surfaces_leave_free_is_named():
         assert abs(motion.axis[2]) > 0.99
         if motion.point is not None:
             assert np.linalg.norm(motion.point[:2]) < 50.0
-    assert any("not determined" in text and "sliding along" in text for text in found.warnings)
+    assert not found.trusted
+    assert any("not determined" in text and "sliding along" in text for text in found.reasons)
 
 
 def test_the_papers_solver_returns_a_rigid_motion(pair):
@@ -197,6 +198,7 @@ def test_arrays_and_files_give_the_same_answer(pair, tmp_path):
 def test_scans_of_very_different_size_are_named(pair):
     found = register(PointCloud(pair.source.points * 9), pair.target, OPTIONS)
     assert any("factor of about" in warning and "same unit" in warning for warning in found.warnings)
+    assert not found.trusted and "factor of about" in found.reasons[0]
     with pytest.raises(InputError, match=r"sizes differ by a factor of about 1.*same unit"):
         register(PointCloud(pair.source.points * 1000), pair.target, OPTIONS)
 

@@ -66,6 +66,9 @@ def test_the_wheel_holds_weights_card_and_type_marker_and_no_tests(wheel):
         "utopic_cli/py.typed",
         "utopic_cli/_weights/utopic.safetensors",
         "utopic_cli/_weights/utopic.json",
+        "utopic_cli/page/align.html",
+        "utopic_cli/page/page.css",
+        "utopic_cli/page/viewer.js",
     } <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "weights/"))]

@@ -56,6 +56,7 @@ def build_report(
         "confidence": result.confidence,
         "trusted": result.trusted,
         "reasons": result.reasons,
+        "signals": result.signals,
         "ambiguous_with": result.ambiguous_with,
         "overlap_ratio": result.fit.overlap_ratio,
         "inlier_ratio": result.fit.inlier_ratio,

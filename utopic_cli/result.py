@@ -94,7 +94,7 @@ class RegistrationResult:
         T_target_source: (4, 4) float64 rigid transformation, ``p_target = T @ p_source``.
         confidence: calibrated probability that the transformation is right, or None where
             the weights carry no calibration.
-        trusted: whether to rely on it, or None where there is no calibrated confidence.
+        trusted: whether to rely on it; never where there is no calibrated confidence.
         reasons: why (or why not), in plain words.
         ambiguous_with: rival (4, 4) transformations that fit nearly as well.
         source_overlap: (N,) float32 in [0, 1], one per source point. Of a file or array with
@@ -108,6 +108,7 @@ class RegistrationResult:
         fit: measures at full resolution.
         observability: which motions the overlap fixes and how well, in file units; None where too
             little overlaps to tell.
+        signals: the numbers the verdict rests on, by name: see ``estimation.evidence``.
         timings_s: seconds per step.
         warnings: things a user should know.
         weights_name: name of the network weights used.
@@ -117,7 +118,7 @@ class RegistrationResult:
 
     T_target_source: np.ndarray
     confidence: float | None
-    trusted: bool | None
+    trusted: bool
     reasons: tuple[str, ...]
     ambiguous_with: tuple[np.ndarray, ...]
     source_overlap: np.ndarray
@@ -129,6 +130,7 @@ class RegistrationResult:
     fit: FitMeasures
     observability: Observability | None
     timings_s: dict[str, float]
+    signals: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     weights_name: str = ""
     weights_sha256: str = ""

@@ -5,10 +5,11 @@ import pytest
 
 from tests.benchmark.conftest import bumpy_object
 from utopic_cli.benchmark.fpfh import Fpfh, dual_softmax
-from utopic_cli.benchmark.matcher import load_matchers, solve_pair
+from utopic_cli.benchmark.matcher import load_matchers
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.geometry.rigid import random_rotation, relative_rotation_error_deg, rigid
+from utopic_cli.look import look_both_sides
 from utopic_cli.pipeline import register
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import prepare
@@ -24,11 +25,12 @@ def clouds() -> tuple[PointCloud, PointCloud, np.ndarray]:
     return PointCloud(source.points[::2]), PointCloud(target.points[1::2]), gt
 
 
-def test_a_network_is_solved_for_as_the_pipeline_does(clouds) -> None:
+def test_a_network_is_solved_for_as_the_pipeline_does(clouds, monkeypatch) -> None:
     source, target, _ = clouds
+    monkeypatch.setattr("utopic_cli.look.UNCLEAR_MARGIN", (1.0, 1.0))  # one sampling
     (network,) = load_matchers(["utopic"], [], seed=3, device="cpu")
     prepared = prepare(source, target, 300)
-    look = solve_pair(prepared, network.look(prepared), network)
+    look = look_both_sides(network.look, prepared)
     options = AlignOptions(points=300, refine=False, seed=3, device="cpu")
     expected = register(source, target, options).T_target_source
     found = look.prepared.denormalise(look.estimate.T_target_source)
@@ -44,7 +46,7 @@ def test_fpfh_aligns_two_parts_of_an_object(clouds) -> None:
     view = fpfh.look(prepared)
     assert view.matching_scores.shape == (len(prepared.source.points), len(prepared.target.points))
     assert (view.source_overlap == 1).all() and (view.target_uncertainty == 0).all()
-    look = solve_pair(prepared, view, fpfh)
+    look = look_both_sides(fpfh.look, prepared)
     T = look.prepared.denormalise(look.estimate.T_target_source)
     assert relative_rotation_error_deg(T, gt) < 2.0
 

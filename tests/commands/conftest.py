@@ -36,9 +36,9 @@ class FakePipeline:
         ramps = [np.linspace(0, 1, len(cloud), dtype=np.float32) for cloud in (source, target)]
         result = RegistrationResult(
             T_target_source=QUARTER_TURN,
-            confidence=None,
-            trusted=None,
-            reasons=(),
+            confidence=0.97,
+            trusted=True,
+            reasons=("the surfaces agree",),
             ambiguous_with=(),
             source_overlap=ramps[0],
             target_overlap=ramps[1],

@@ -14,7 +14,8 @@ from utopic_cli.commands.align import align
 from utopic_cli.commands.outputs import CLOUD_KINDS
 from utopic_cli.result import FitMeasures
 
-WHOLE_SET = {"transformation.txt", "aligned.ply", "report.json", *(f"{kind}.ply" for kind in CLOUD_KINDS)}
+CLOUDS = {f"{kind}.ply" for kind in CLOUD_KINDS}
+WHOLE_SET = {"transformation.txt", "aligned.ply", "report.html", "report.json", *CLOUDS}
 
 
 def strict_json(text):
@@ -53,7 +54,7 @@ def test_matrix_alone_goes_to_stdout_and_the_summary_to_stderr(cli, fake, scans)
     np.testing.assert_array_equal(matrix, QUARTER_TURN)
     assert "75% of the source, 50% of the target" in result.stderr
     assert "90.000 degrees" in result.stderr
-    assert "an answer was found, unverified" in result.stderr
+    assert "aligned; confidence 97%" in result.stderr and "because  the surfaces agree" in result.stderr
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".npy", ".json"])
@@ -110,6 +111,20 @@ def test_coloured_clouds_carry_both_fields_at_every_point_and_are_redder_where_t
         assert redness[np.argmin(shown)] < -50
 
 
+def test_the_page_names_both_files_holds_the_matrix_and_repeats_warnings(cli, fake, scans, tmp_path):
+    fake.changes = {"warnings": ("watch out",)}
+    result = cli("align", *scans, "--html", tmp_path / "p.html")
+    assert result.exit_code == 0, result.stderr
+    assert f"wrote    {tmp_path / 'p.html'}" in result.stderr
+    page = (tmp_path / "p.html").read_bytes().decode("utf-8")
+    assert page.startswith("<!doctype html>")
+    for wanted in ("a.ply", "b.ply", "watch out", "0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1"):
+        assert wanted in page
+    refused = cli("align", *scans, "--html", tmp_path / "p.html")
+    assert refused.exit_code == 5
+    assert "p.html: exists already" in refused.stderr
+
+
 def test_merged_holds_both_scans_in_the_targets_frame(cli, fake, scans, tmp_path):
     assert cli("align", *scans, "--merged", tmp_path / "m.ply").exit_code == 0
     fields = read_points(tmp_path / "m.ply")
@@ -141,7 +156,7 @@ def test_the_report_says_everything_promised(cli, fake, scans, tmp_path):
     assert set(promised.split()) <= set(report)
     assert report["schema_version"] == 1
     assert report["convention"] == "p_target = T_target_source @ p_source"
-    assert report["confidence"] is None
+    assert report["confidence"] == 0.97 and report["trusted"] is True
     assert report["not_measured"] == {}
     assert report["unobservable"] == [{"kind": "rotation", "axis": [0, 0, 1], "point": [1, 2, 0]}]
     assert np.shape(report["covariance"]) == (6, 6) and report["covariance_about"] == [0, 0, 0]
@@ -213,3 +228,11 @@ def test_the_same_run_twice_writes_the_same_bytes(cli, fake, scans, tmp_path):
         cli("align", *scans, "--out-dir", tmp_path / name)
     for name in WHOLE_SET - {"report.json"}:
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+
+
+def test_weights_without_a_calibration_are_never_trusted(cli, fake, scans):
+    fake.changes = {"trusted": False, "confidence": None, "reasons": ("no calibration",)}
+    result = cli("align", *scans)
+    assert result.exit_code == 3
+    assert "do not trust it unseen" in result.stderr and "because  no calibration" in result.stderr
+    np.testing.assert_array_equal(np.loadtxt(result.stdout.splitlines()), QUARTER_TURN)

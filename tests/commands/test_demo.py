@@ -34,11 +34,12 @@ def test_demo_writes_the_whole_set_and_says_how_far_off_it_is(cli, fake, tmp_pat
     assert result.exit_code == 0, result.output
     assert result.stdout == ""
     assert "error    0.000 degrees and 0.000% of the object's size" in result.stderr
+    assert f"open {tmp_path / 'd' / 'report.html'} in a browser" in result.stderr
     assert str(tmp_path / "d" / "aligned.ply") in result.stderr
     written = {path.name for path in (tmp_path / "d").iterdir()}
     assert written == {
-        "source.ply", "target.ply", "transformation.txt", "aligned.ply", "report.json", "source_overlap.ply",
-        "target_overlap.ply", "source_uncertainty.ply", "target_uncertainty.ply",
+        "source.ply", "target.ply", "transformation.txt", "aligned.ply", "report.html", "report.json",
+        "source_overlap.ply", "target_overlap.ply", "source_uncertainty.ply", "target_uncertainty.ply",
     }  # fmt: skip
     np.testing.assert_array_equal(read_scan(tmp_path / "d" / "source.ply").cloud.points, pair.source.points)
     report = json.loads((tmp_path / "d" / "report.json").read_text())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from utopic_cli.estimation.solver import Problem
+from utopic_cli.estimation.problem import Problem
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.voxel import voxel_downsample
 from utopic_cli.point_cloud import PointCloud

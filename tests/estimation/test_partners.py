@@ -13,9 +13,10 @@ from utopic_cli.estimation.partners import (
     partner_evidence,
     partner_reach,
 )
+from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.refinement import refine
-from utopic_cli.estimation.solver import Problem, solve
+from utopic_cli.estimation.solver import solve
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.normals import estimate_normals, orient_normals
 from utopic_cli.point_cloud import PointCloud

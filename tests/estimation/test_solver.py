@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import VOXEL, make_problem
-from utopic_cli.estimation.solver import Estimate, Problem, solve
+from utopic_cli.estimation.candidates import Candidate
+from utopic_cli.estimation.problem import Problem
+from utopic_cli.estimation.solver import Estimate, solve
 from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud
 
@@ -35,7 +37,7 @@ def test_solves_a_pair_with_mostly_wrong_scores(
 ) -> None:
     estimate = automatic if solver == "auto" else solve(hard_problem, solver)
     assert_right(estimate.T_target_source, gt_transformation)
-    assert estimate.score == pytest.approx(estimate.fit - estimate.violation)
+    assert estimate.score == pytest.approx(estimate.best.fit - estimate.best.violation)
     assert all(rival.score <= estimate.score for rival in estimate.rivals)
     assert 0 < estimate.support < 1
     pairs = estimate.correspondences
@@ -127,3 +129,33 @@ def test_input_that_fits_no_problem_is_refused(hard_problem: Problem) -> None:
         solve(hard_problem, initial=np.zeros((4, 4)))
     with pytest.raises(ValueError, match="no transformation"):
         solve(replace(hard_problem, matching_scores=np.zeros_like(hard_problem.matching_scores)))
+
+
+def test_standing_prefers_what_agrees_where_it_meets_over_what_covers_more() -> None:
+    def candidate(score: float, plausibility: float, support: float) -> Candidate:
+        return Candidate(np.eye(4), score, score, 0.0, "consensus", support, plausibility)
+
+    roughly_over_everything = candidate(0.44, 0.48, 0.065)
+    exactly_over_a_part = candidate(0.39, 0.59, 0.12)
+    assert exactly_over_a_part.standing > roughly_over_everything.standing
+    assert candidate(0.4, 0.5, 0.0).standing == candidate(0.4, 0.5, 1e-9).standing
+
+
+def test_two_estimates_of_one_pair_are_joined(
+    automatic: Estimate, gt_transformation: np.ndarray, scans: Scans
+) -> None:
+    points = scans[0].points
+    nudge = rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 0.005, 0.0])), np.zeros(3))
+    turn = rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 2.0, 0.0])), np.zeros(3))
+
+    def answering(motion: np.ndarray) -> Estimate:
+        T = automatic.T_target_source @ motion
+        return replace(automatic, best=replace(automatic.best, T_target_source=T), rivals=())
+
+    agreeing = automatic.with_rivals(answering(nudge), points)
+    assert agreeing.margin == automatic.margin  # the same answer is no rival
+    doubted = automatic.with_rivals(answering(turn), points)
+    assert doubted.margin == 0.0 and len(doubted.rivals) >= 1
+    np.testing.assert_array_equal(doubted.rivals[0].T_target_source, automatic.T_target_source @ turn)
+    standings = [rival.standing for rival in doubted.rivals]
+    assert standings == sorted(standings, reverse=True)

@@ -6,11 +6,12 @@ import time
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from utopic_cli.benchmark.matcher import Look, Matcher, solve_pair
+from utopic_cli.benchmark.matcher import Matcher
 from utopic_cli.benchmark.pair_metrics import (
     KnownNodes,
     MatchMeasures,
@@ -23,8 +24,11 @@ from utopic_cli.benchmark.pair_metrics import (
 )
 from utopic_cli.benchmark.protocols import AnyProtocol
 from utopic_cli.benchmark.uncertainty import UncertaintyByPlace, measure_uncertainty
+from utopic_cli.bridge import NetworkView
+from utopic_cli.errors import InputError
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.refinement import refine
+from utopic_cli.look import Look, look_both_sides
 from utopic_cli.preprocess import PreparedPair, prepare
 
 if TYPE_CHECKING:
@@ -137,12 +141,11 @@ class _Desk:
     def ask(self, matcher: Matcher) -> list[Answer]:
         """Return the answers ``solved`` and ``refined``."""
         seconds: dict[str, float] = {}
-        with _cpu(seconds, "look"):
-            view = matcher.look(self._prepared)
         try:
             with _cpu(seconds, "solve"):
-                look = solve_pair(self._prepared, view, matcher)
-        except ValueError as error:  # no transformation follows from the scores
+                look = look_both_sides(partial(_look, matcher, seconds), self._prepared)
+            seconds["solve"] -= seconds["look"]
+        except InputError as error:  # no transformation follows from the scores
             return [
                 Answer(
                     **self._about, method=matcher.name, stage=stage, cpu_seconds=seconds, message=str(error)
@@ -196,9 +199,14 @@ class _Desk:
         )
 
 
+def _look(matcher: Matcher, seconds: dict[str, float], prepared: PreparedPair) -> NetworkView:
+    with _cpu(seconds, "look"):
+        return matcher.look(prepared)
+
+
 @contextmanager
 def _cpu(seconds: dict[str, float], step: str) -> Iterator[None]:
-    """Note the CPU time of the block, all threads of this process."""
+    """Add the CPU time of the block, all threads of this process."""
     begin = time.process_time()
     yield
-    seconds[step] = time.process_time() - begin
+    seconds[step] = seconds.get(step, 0.0) + time.process_time() - begin

@@ -1,9 +1,9 @@
-"""What finds correspondences, behind one small interface, and the solve that is the same for all."""
+"""What finds correspondences, behind one small interface; the solve is the same for all."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,9 +12,7 @@ from utopic_cli.benchmark.baselines import load_open3d
 from utopic_cli.benchmark.fpfh import Fpfh
 from utopic_cli.bridge import NetworkView, load_network, predict
 from utopic_cli.errors import UsageError
-from utopic_cli.estimation.solver import Estimate, Problem, solve
 from utopic_cli.model.utopic import Utopic
-from utopic_cli.pipeline import CLEAR_OUTWARDNESS, CLEAR_SCORE
 from utopic_cli.preprocess import PreparedPair
 
 BASELINES = ("fpfh",)
@@ -123,60 +121,3 @@ def check_baselines(names: Sequence[str]) -> None:
             raise UsageError(f"unknown baseline {name!r}; this protocol knows: {', '.join(BASELINES)}")
     if names:
         load_open3d()
-
-
-@dataclass(frozen=True)
-class Look:
-    """One matcher's answer to one pair, before any final refinement.
-
-    Attributes:
-        prepared: the pair as it was seen in the end.
-        view: what was seen.
-        estimate: the robust solve's answer, in normalised units.
-    """
-
-    prepared: PreparedPair
-    view: NetworkView
-    estimate: Estimate
-
-
-def solve_pair(prepared: PreparedPair, view: NetworkView, matcher: Matcher) -> Look:
-    """Solve for the transformation as the pipeline does, from any matcher's view.
-
-    As there, a pair whose normals may lie on opposite sides is also tried with the source
-    turned inside out.
-
-    Args:
-        prepared: the pair.
-        view: the matcher's first look.
-        matcher: asked once more if the source is turned inside out.
-
-    Raises:
-        ValueError: no transformation follows from the scores.
-    """
-    estimate = _solve(prepared, view)
-    sheet = min(prepared.source.outwardness, prepared.target.outwardness) < CLEAR_OUTWARDNESS
-    if sheet or estimate.score < CLEAR_SCORE:
-        reversed_pair = replace(prepared, source=prepared.source.turned_inside_out())
-        reversed_view = matcher.look(reversed_pair)
-        other = _solve(reversed_pair, reversed_view)
-        if other.score > estimate.score:
-            return Look(reversed_pair, reversed_view, other)
-    return Look(prepared, view, estimate)
-
-
-def _solve(prepared: PreparedPair, view: NetworkView) -> Estimate:
-    return solve(
-        Problem(
-            source_nodes=prepared.source.points,
-            target_nodes=prepared.target.points,
-            matching_scores=view.matching_scores,
-            source_overlap=view.source_overlap,
-            target_overlap=view.target_overlap,
-            source_certainty=1.0 - view.source_uncertainty,
-            target_certainty=1.0 - view.target_uncertainty,
-            source_dense=prepared.source.dense,
-            target_dense=prepared.target.dense,
-            spacing=prepared.spacing,
-        )
-    )

@@ -55,7 +55,8 @@ def align(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="The whole set: transformation.txt, the aligned scan, four coloured PLYs, report.json.",
+            help="The whole set: transformation.txt, the aligned scan, four coloured PLYs, report.html, "
+            "report.json.",
             rich_help_panel=_OUTPUTS,
         ),
     ] = None,
@@ -85,6 +86,14 @@ def align(
     ] = None,
     report: Annotated[
         Path | None, typer.Option(metavar="PATH", help="The JSON report.", rich_help_panel=_OUTPUTS)
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="A page to look at in a browser, offline: 3D view, verdict, numbers.",
+            rich_help_panel=_OUTPUTS,
+        ),
     ] = None,
     json_report: Annotated[
         bool,
@@ -145,6 +154,7 @@ def align(
             merged=merged,
             clouds=clouds,
             report=report,
+            page=html,
         ),
         options=AlignOptions(
             weights=weights,
@@ -167,7 +177,7 @@ def align(
         from utopic_cli.io.transformation import format_transformation
 
         _to_stdout(format_transformation(outcome.result.T_target_source, ".txt"))
-    if outcome.result.trusted is False and not exit_zero:
+    if not outcome.result.trusted and not exit_zero:
         raise typer.Exit(NOT_TRUSTED)
 
 
@@ -263,7 +273,7 @@ def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> N
 
 def _verdict(result: RegistrationResult) -> str:
     if result.confidence is None:
-        return "an answer was found, unverified"
+        return "aligned, but nothing says how well: do not trust it unseen"
     verdict = "aligned" if result.trusted else "aligned, but do not trust it"
     return f"{verdict}; confidence {result.confidence:.0%}"
 

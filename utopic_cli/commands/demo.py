@@ -76,7 +76,8 @@ def demo(
         outcome = run(request, console)
         undo.pop_all()
     _say_error(outcome, pair, console)
-    console.line(f"look at {out_dir / 'aligned.ply'} together with {target} in any viewer;")
+    console.line(f"open {out_dir / 'report.html'} in a browser: both scans in 3D, and the numbers;")
+    console.line(f"or look at {out_dir / 'aligned.ply'} together with {target} in any viewer;")
     console.line(
         "*_overlap.ply and *_uncertainty.ply are redder where there is more; report.json has the numbers"
     )

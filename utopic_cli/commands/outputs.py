@@ -30,7 +30,7 @@ class OutputPlan:
 
     Attributes:
         files: (kind, path) in the order of writing; a kind is ``transformation``, ``aligned``,
-            ``merged``, one of ``CLOUD_KINDS`` or ``report``, and may come twice.
+            ``merged``, one of ``CLOUD_KINDS``, ``html`` or ``report``, and may come twice.
         folders: folders of whole sets, made if only they themselves are missing.
     """
 
@@ -52,6 +52,7 @@ def plan_outputs(
     merged: Path | None = None,
     clouds: Path | None = None,
     report: Path | None = None,
+    page: Path | None = None,
 ) -> OutputPlan:
     """Turn the output options into a list of files.
 
@@ -73,6 +74,7 @@ def plan_outputs(
         files.append(("aligned", out_dir / f"aligned{source.suffix}"))
     sets = [folder for folder in (clouds, out_dir) if folder is not None]
     files += [(kind, folder / f"{kind}.ply") for folder in sets for kind in CLOUD_KINDS]
+    files += [("html", page), ("html", out_dir / "report.html" if out_dir else None)]
     files += [("report", report), ("report", out_dir / "report.json" if out_dir else None)]
     return OutputPlan(
         files=tuple((kind, path) for kind, path in files if path is not None),
@@ -154,11 +156,28 @@ def make_outputs(
         elif kind == "merged":
             moved = source.cloud.transformed(result.T_target_source)
             contents[path] = merged_cloud_ply(moved.points, target.cloud.points, MERGED_COMMENTS)
+        elif kind == "html":
+            contents[path] = page_of(source, target, result)
         elif kind == "report":
             contents[path] = report
         else:
             contents[path] = coloured_cloud(kind, source, target, result)
     return contents
+
+
+def page_of(source: Scan, target: Scan, result: RegistrationResult) -> bytes:
+    """Return the self-contained HTML page of one alignment."""
+    from utopic_cli import page
+    from utopic_cli.report import all_warnings
+
+    return page.render(
+        result,
+        source.cloud,
+        target.cloud,
+        source_name=source.path.name,
+        target_name=target.path.name,
+        warnings=all_warnings(source, target),
+    ).encode("utf-8")
 
 
 def coloured_cloud(kind: str, source: Scan, target: Scan, result: RegistrationResult) -> bytes:

@@ -1,0 +1,114 @@
+"""The verdict: trusted or not, and the reasons a person reads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from utopic_cli.errors import InputError
+from utopic_cli.estimation.confidence import Calibration
+from utopic_cli.estimation.evidence import SAME
+from utopic_cli.geometry import rigid
+from utopic_cli.result import FreeMotion, Observability
+from utopic_cli.verdict import UNCALIBRATED, judge, motion_in_words, read_calibration
+
+GOOD = {"likeness": 1.0, "conflict": 0.0, "spread": SAME, "support": -0.6, "lead": 0.5}
+FIXED = Observability(np.full(6, 0.3), (), np.eye(6), np.zeros(3), 500)
+
+
+def calibration(lead: float = 10.0) -> Calibration:
+    """Confidence from the lead alone: one half at 0.25."""
+    one = np.ones(1)
+    return Calibration(("lead",), 0 * one, one, 0.25 * one, one, lead * one, 0.0, threshold=0.9)
+
+
+def verdict(signals: dict[str, float] | None = None, rivals: Any = (), seen: Any = FIXED, share: float = 0.6):  # type: ignore[no-untyped-def]
+    ratio = {"source": 0.7, "target": share}
+    return judge(calibration(), {**GOOD, **(signals or {})}, np.eye(4), rivals, seen, ratio)
+
+
+def test_a_clear_answer_is_trusted_and_says_why() -> None:
+    found = verdict()
+    assert found.trusted and found.confidence == pytest.approx(1.0 / (1.0 + np.exp(-2.5)))
+    assert len(found.reasons) == 1 and "the surfaces agree" in found.reasons[0]
+
+
+def test_confidence_under_the_threshold_is_not_trusted() -> None:
+    found = verdict({"lead": 0.2})
+    assert not found.trusted and found.confidence is not None and found.confidence < 0.5
+    assert "together they fall short of the 90%" in found.reasons[0]
+
+
+def test_without_a_calibration_nothing_is_trusted() -> None:
+    found = judge(None, GOOD, np.eye(4), (), FIXED, {"source": 0.7, "target": 0.7})
+    assert (found.confidence, found.trusted, found.reasons) == (None, False, (UNCALIBRATED,))
+
+
+@pytest.mark.parametrize(
+    ("signals", "said"),
+    [
+        ({"likeness": 0.4}, "where the scans meet their surfaces differ: they agree on 40%"),
+        ({"conflict": 0.2}, "stand where the other saw empty space"),
+        ({"spread": -0.4}, "another sampling of the same scans gave another answer"),
+        ({"support": -2.0}, "explains only 1.0% of what the network matched"),
+    ],
+)
+def test_each_bad_sign_is_named(signals: dict[str, float], said: str) -> None:
+    found = verdict({**signals, "lead": 0.0})
+    assert len(found.reasons) == 1 and said in found.reasons[0]
+
+
+def test_little_overlap_is_named_with_its_scan() -> None:
+    assert "only 4% of the target finds a counterpart" in verdict({"lead": 0.0}, share=0.04).reasons[0]
+
+
+def test_free_motions_are_named_by_kind_and_axis() -> None:
+    turn = FreeMotion("rotation", np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    slide = FreeMotion("translation", np.array([0.6, -0.8, 1e-9]))
+    seen = Observability(np.zeros(6), (turn,), np.eye(6), np.zeros(3), 500)
+    (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
+    assert reason == "symmetric: rotation about the axis (0, 0, 1) is not determined"
+    seen = Observability(np.zeros(6), (turn, slide), np.eye(6), np.zeros(3), 500)
+    (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
+    assert reason.endswith("(0, 0, 1) and sliding along (0.6, -0.8, 0) are not determined")
+    assert (
+        motion_in_words(FreeMotion("translation", np.array([-1e-9, 0.0, 1.0]))) == "sliding along (0, 0, 1)"
+    )
+
+
+def test_where_nothing_meets_that_is_said() -> None:
+    assert "too few points lie on each other" in verdict({"lead": 0.0}, seen=None).reasons[0]
+
+
+def test_rivals_are_counted_and_their_angle_told() -> None:
+    quarter, half = (
+        rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 0.0, np.radians(angle)])), np.zeros(3))
+        for angle in (90.0, 180.0)
+    )
+    assert "two poses fit about equally well, 90° apart" in verdict({"lead": 0.0}, [quarter]).reasons[0]
+    assert "3 poses fit about equally well, 180° apart" in verdict({"lead": 0.0}, [quarter, half]).reasons[0]
+
+
+def test_sizes_that_differ_like_units_come_first() -> None:
+    ratio = {"source": 0.7, "target": 0.02}
+    found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, size_ratio=987.0)
+    assert found.reasons[0] == "the scans' sizes differ by a factor of about 987: millimetres against metres?"
+    found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, size_ratio=12.0)
+    assert found.reasons[0].endswith("about 12: are both in the same unit?")
+
+
+def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
+    found = verdict({"conflict": 0.2})
+    assert found.trusted and len(found.reasons) == 2 and "empty space" in found.reasons[1]
+
+
+def test_a_card_without_a_calibration_has_none_and_a_damaged_one_is_an_error() -> None:
+    assert read_calibration({"name": "mine"}) is None
+    assert read_calibration({"name": "mine", "calibration": None}) is None
+    assert read_calibration({"calibration": calibration().as_dict()}) is not None
+    with pytest.raises(InputError, match="mine: the calibration"):
+        read_calibration({"name": "mine", "calibration": {"signals": ["a"]}})
+    with pytest.raises(InputError, match="mine: the calibration"):
+        read_calibration({"name": "mine", "calibration": "yes"})

@@ -1,0 +1,173 @@
+"""Candidates for the answer: hypotheses, refined by coarse ICP, verified, and weighed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from utopic_cli.estimation.consensus import Hypothesis, distinct
+from utopic_cli.estimation.meeting import meet
+from utopic_cli.estimation.partners import (
+    BEYOND_CHANCE,
+    approach_partners,
+    fit_partners,
+    partner_evidence,
+    partner_reach,
+)
+from utopic_cli.estimation.problem import Problem, explained
+from utopic_cli.estimation.refinement import Stage, refine_coarse
+from utopic_cli.estimation.surface import Surface
+from utopic_cli.estimation.verification import verify
+from utopic_cli.geometry import rigid
+from utopic_cli.result import Correspondences
+
+MERGE_DISTANCE = 8.0  # voxels
+REFINED = 8  # measured: what ranks lower after screening never turns out best
+REFINED_SPARSE = 30  # partners may yet speak for it
+APPROACHED = 3
+LEAST_SUPPORT = 1e-3  # of the correspondences' weight: less is the same
+SCREENING = (Stage(5.0, 6, 250), Stage(3.0, 4, 250))
+COARSE = (Stage(3.0, 8, 1000), Stage(1.2, 8, 1000))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A refined and verified transformation.
+
+    Attributes:
+        T_target_source: (4, 4) float64.
+        score: fit minus free-space violation.
+        fit: share of points with a close neighbour and agreeing normals, mean of both ways.
+        violation: share of points that stand where the other scan saw free space.
+        origin: ``consensus``, ``assignment`` or ``initial``.
+        support: share of the correspondences' weight that it explains.
+        plausibility: how well the surfaces agree where they meet; see ``Meeting``.
+    """
+
+    T_target_source: np.ndarray
+    score: float
+    fit: float
+    violation: float
+    origin: str
+    support: float = 0.0
+    plausibility: float = 0.0
+
+    @property
+    def standing(self) -> float:
+        """What candidates are ranked by in the end: score, plausibility and support together.
+
+        The score alone likes a wrong transformation that lays much of one scan roughly on the other
+        better than a right one of scans that share little. The weights were chosen on simulated
+        scans of shapes held out from training; half or twice of each does about as well.
+        """
+        support = np.log10(max(self.support, LEAST_SUPPORT))
+        return float(self.score + 0.5 * self.plausibility + 0.1 * support)
+
+
+def screen(
+    hypotheses: list[Hypothesis], source: Surface, target: Surface, *, refine: bool
+) -> list[Hypothesis]:
+    """Draw each hypothesis into the nearest fit with few points; its score becomes that fit's."""
+    transformations = np.stack([hypothesis.T_target_source for hypothesis in hypotheses])
+    if refine:
+        transformations = refine_coarse(source, target, transformations, SCREENING)
+    score = verify(source, target, transformations, samples=500).score
+    return [
+        Hypothesis(T, float(quick), hypothesis.origin)
+        for T, quick, hypothesis in zip(transformations, score, hypotheses, strict=True)
+    ]
+
+
+def refine_candidates(
+    problem: Problem, screened: list[Hypothesis], source: Surface, target: Surface, *, refine: bool
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Refine and verify the best of the screened hypotheses.
+
+    Returns:
+        The distinct candidates, best first, and those of them whose points have partners.
+    """
+    screened = sorted(screened, key=lambda hypothesis: -hypothesis.score)
+    transformations = np.stack([hypothesis.T_target_source for hypothesis in screened])
+    centre = source.points.mean(axis=0)
+    apart = MERGE_DISTANCE * target.voxel
+    most = REFINED_SPARSE if _nodes_are_points(problem) else REFINED
+    kept = distinct(transformations, centre, apart / 4, 2.5)[:most]
+    transformations, origins = transformations[kept], np.array([screened[i].origin for i in kept])
+    if refine:
+        transformations = refine_coarse(source, target, transformations, COARSE)
+    candidates = _verified(transformations, origins, source, target)
+    kept = distinct(np.stack([candidate.T_target_source for candidate in candidates]), centre, apart)
+    candidates = [candidates[i] for i in kept]
+    return candidates, _with_partners(problem, candidates, source, target) if refine else []
+
+
+def _verified(
+    transformations: np.ndarray, origins: np.ndarray, source: Surface, target: Surface
+) -> list[Candidate]:
+    """Score (H, 4, 4) transformations; best first."""
+    verdict = verify(source, target, transformations)
+    return [
+        Candidate(
+            rigid.rigid(rigid.nearest_rotation(transformations[i, :3, :3]), transformations[i, :3, 3]),
+            float(verdict.score[i]),
+            float(verdict.fit[i]),
+            float(verdict.violation[i]),
+            str(origins[i]),
+        )
+        for i in np.argsort(-verdict.score, kind="stable")
+    ]
+
+
+def weigh(
+    problem: Problem,
+    candidates: list[Candidate],
+    correspondences: Correspondences,
+    tolerance: float,
+    source: Surface,
+    target: Surface,
+) -> list[Candidate]:
+    """Add to each candidate what its standing needs: plausibility and support."""
+    total = max(float(correspondences.weights.sum()), 1e-300)
+    return [
+        replace(
+            candidate,
+            plausibility=meet(source, target, candidate.T_target_source).plausibility,
+            support=float(
+                explained(problem, correspondences, candidate.T_target_source, tolerance).weights.sum()
+                / total
+            ),
+        )
+        for candidate in candidates
+    ]
+
+
+def _nodes_are_points(problem: Problem) -> bool:
+    """Tell sparse clouds, used whole, from dense scans, whose nodes are means of many points."""
+    return len(problem.source_nodes) >= len(problem.source_dense) and (
+        len(problem.target_nodes) >= len(problem.target_dense)
+    )
+
+
+def _with_partners(
+    problem: Problem, candidates: list[Candidate], source: Surface, target: Surface
+) -> list[Candidate]:
+    """Return the candidates under which the clouds turn out to share points, refitted to them.
+
+    Usually none is left, and the surfaces decide. Where some are, the coincidence of single
+    points is the stronger witness: it tells even symmetric poses apart.
+    """
+    nodes = problem.source_nodes, problem.target_nodes
+    reach = partner_reach(*nodes) if _nodes_are_points(problem) else 0.0
+    if not reach > 0:
+        return []
+    evidence = partner_evidence(*nodes, np.stack([each.T_target_source for each in candidates]), reach)
+    candidates = [candidates[i] for i in np.argsort(-evidence, kind="stable")[:APPROACHED]]
+    approached = np.stack([approach_partners(*nodes, each.T_target_source, reach) for each in candidates])
+    evidence = partner_evidence(*nodes, approached, reach)
+    order = [i for i in np.argsort(-evidence, kind="stable") if evidence[i] > BEYOND_CHANCE]
+    fitted = [fit_partners(*nodes, approached[i], reach) for i in order]
+    return [
+        _verified(T[None], np.array([candidates[i].origin]), source, target)[0]
+        for i, T in zip(order, fitted, strict=True)
+    ]

@@ -1,0 +1,163 @@
+"""What speaks for and against one transformation: dimensionless signals for the verdict.
+
+A wrong transformation can lay two surfaces on each other over a good part, and a right one of
+scans that hardly overlap explains little of either; so no single number tells them apart. These
+signals look at the same answer from several sides: how well the surfaces agree *where they meet*,
+whether one scan's points stand in the other's free space, how far the next best answer is behind,
+which motions the geometry fixes, and what the network thinks of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from utopic_cli.estimation.candidates import LEAST_SUPPORT
+from utopic_cli.estimation.meeting import MEETING, meet
+from utopic_cli.estimation.solver import Estimate
+from utopic_cli.estimation.surface import Surface
+from utopic_cli.geometry import rigid
+from utopic_cli.result import FitMeasures, Observability
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The signals a verdict rests on, all dimensionless; more is better unless said otherwise.
+
+    Attributes:
+        score: fit both ways minus free-space violation, as the solver ranks by.
+        overlap: share of the scan with less of it that meets the other one.
+        agreement: see ``Meeting``.
+        likeness: see ``Meeting``.
+        tightness: see ``Meeting``; less is better.
+        turning: see ``Meeting``; less is better.
+        conflict: see ``Meeting``; less is better.
+        margin: by how much the answer's standing (see ``Candidate``) exceeds that of its best rival.
+        lead: by how much the answer is more plausible (see ``Meeting``) than the most plausible rival.
+        support: log10 of the share of the correspondences' weight that the transformation explains.
+        support_lead: log10 of that share over what the best supported rival explains.
+        explained: natural logarithm of one plus the number of correspondences explained.
+        fixed: log10 of the smallest eigenvalue of the normal matrix over the largest.
+        extent: log10 of the number of voxels in which the surfaces agree.
+        seen_overlap: mean overlap the network gives the points that meet the other scan.
+        seen_contrast: ``seen_overlap`` minus the mean it gives the others.
+        uncertainty: mean raw uncertainty of the points that meet the other scan; less is better.
+        residual: 90th percentile over the median of the full-resolution residuals; less is better.
+        spread: log10 of the distance between the answers to two samplings of the scans, as a share of
+            their size; less is better. ``SAME`` where the first answer was clear enough to ask no more.
+        shared: 1 if the clouds turned out to share points, else 0.
+    """
+
+    score: float
+    overlap: float
+    agreement: float
+    likeness: float
+    tightness: float
+    turning: float
+    conflict: float
+    margin: float
+    lead: float
+    support: float
+    support_lead: float
+    explained: float
+    fixed: float
+    extent: float
+    seen_overlap: float
+    seen_contrast: float
+    uncertainty: float
+    residual: float
+    spread: float
+    shared: float
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the signals by name."""
+        return asdict(self)
+
+
+SAME = -3.0
+"""Answers a thousandth of the size apart are one and the same."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the network says of the sampled points of a pair, both scans' after each other.
+
+    Attributes:
+        source: (N, 3) sampled points of the source.
+        target: (M, 3) sampled points of the target.
+        overlap: (N + M,) probability of lying in the overlap.
+        uncertainty: (N + M,) raw.
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+    overlap: np.ndarray
+    uncertainty: np.ndarray
+
+
+def collect_evidence(
+    source: Surface,
+    target: Surface,
+    transformation: np.ndarray,
+    estimate: Estimate,
+    seen: Seen,
+    fit: FitMeasures,
+    observability: Observability | None,
+    spread: float,
+) -> Evidence:
+    """Collect what speaks for and against an answer.
+
+    Args:
+        source: the scan that moves.
+        target: the scan that stays.
+        transformation: (4, 4) the answer, refined, in the surfaces' frame.
+        estimate: of the solver, with the answer's rivals.
+        seen: by the network, shown the answer.
+        fit: at full resolution.
+        observability: None where too little overlaps to tell.
+        spread: see ``Evidence``.
+    """
+    meeting = meet(source, target, transformation)
+    rivals = [rival.plausibility for rival in estimate.rivals]
+    rival_support = max((rival.support for rival in estimate.rivals), default=0.0)
+    reach = MEETING * source.voxel
+    there = source.tree.query(rigid.apply(rigid.invert(transformation), seen.target))[0] < reach
+    met = np.concatenate([target.tree.query(rigid.apply(transformation, seen.source))[0] < reach, there])
+    inside = float(seen.overlap[met].mean()) if met.any() else 0.0
+    outside = float(seen.overlap[~met].mean()) if not met.all() else 0.0
+    median, high = fit.residual_percentiles["p50"], fit.residual_percentiles["p90"]
+    support = np.log10(max(estimate.support, LEAST_SUPPORT))
+    return Evidence(
+        score=estimate.score,
+        overlap=min(meeting.source_share, meeting.target_share),
+        agreement=meeting.agreement,
+        likeness=meeting.likeness,
+        tightness=meeting.tightness,
+        turning=meeting.turning,
+        conflict=meeting.conflict,
+        margin=estimate.margin,
+        lead=meeting.plausibility - max(rivals, default=0.0),
+        support=float(support),
+        support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
+        explained=float(np.log1p(len(estimate.correspondences))),
+        fixed=_smallest_eigenvalue(observability),
+        extent=float(np.log10(max(meeting.voxels, 1))),
+        seen_overlap=inside,
+        seen_contrast=inside - outside,
+        uncertainty=float(seen.uncertainty[met].mean() if met.any() else seen.uncertainty.mean()),
+        residual=high / median if median > 0 else MOST_RESIDUAL,  # NaN too: nothing has a counterpart
+        spread=spread,
+        shared=float(estimate.shared_points),
+    )
+
+
+MOST_RESIDUAL = 10.0
+
+
+def _smallest_eigenvalue(observability: Observability | None) -> float:
+    """Log10 of the smallest eigenvalue over the largest, at least -5; -5 too where nothing is known."""
+    if observability is None:
+        return -5.0
+    eigenvalues = observability.eigenvalues
+    return float(np.log10(max(eigenvalues[0] / max(eigenvalues[-1], 1e-300), 1e-5)))

@@ -1,0 +1,132 @@
+"""How two surfaces lie on each other under a transformation: where they meet, and whether they agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from utopic_cli.estimation.surface import Surface
+from utopic_cli.estimation.verification import AGREEING, CLOSE, FREE_SPACE_MARGIN
+from utopic_cli.geometry import rigid
+
+MEETING = 3.0
+"""Points within this many voxels of the other surface meet it, for better or worse."""
+
+SAMPLES = 4000
+MOST_ALIKE = 1.2
+NEXT = 4
+"""The neighbour a scan is compared with in itself: about as far as one of another scan."""
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """How two surfaces lie on each other, both ways.
+
+    Attributes:
+        source_share: share of the source's points within ``MEETING`` voxels of the target.
+        target_share: likewise, of the target's points.
+        agreement: of the points that meet the other surface, the share that lies in it (close to
+            the tangent plane, normals alike): lower where the surfaces cross, and where they are rough.
+        likeness: ``agreement`` over the share of neighbours within one scan that agree as much: near 1
+            where the surfaces coincide, however rough they are; at most ``MOST_ALIKE``.
+        tightness: median distance from the tangent plane of those that agree, in voxels.
+        turning: median angle between the normals of the points that meet, as 1 - cosine.
+        violation: share of points that stand where the other scan saw free space.
+        conflict: ``violation`` in proportion to the points that meet the other surface.
+        voxels: number of points that agree, of the scan with fewer of them.
+    """
+
+    source_share: float
+    target_share: float
+    agreement: float
+    likeness: float
+    tightness: float
+    turning: float
+    violation: float
+    conflict: float
+    voxels: int
+
+    @property
+    def plausibility(self) -> float:
+        """How well the meeting goes for its size: likeness times the root of the share, minus conflict."""
+        share = (self.source_share + self.target_share) / 2.0
+        return self.likeness * float(np.sqrt(share)) - self.conflict
+
+
+def meet(source: Surface, target: Surface, transformation: np.ndarray) -> Meeting:
+    """Measure how two surfaces lie on each other.
+
+    Args:
+        source: the scan that moves.
+        target: the scan that stays.
+        transformation: (4, 4) T_target_source.
+    """
+    forward = _one_way(source, target, transformation)
+    backward = _one_way(target, source, rigid.invert(transformation))
+    met, agreed = forward.met + backward.met, forward.agreed + backward.agreed
+    beside = np.concatenate([forward.beside, backward.beside])
+    turning = np.concatenate([forward.turning, backward.turning])
+    violation = (forward.violation + backward.violation) / 2.0
+    share = (forward.met / forward.points + backward.met / backward.points) / 2.0
+    agreement = agreed / met if met else 0.0
+    alike = max(min(_self_agreement(source), _self_agreement(target)), 0.05)
+    return Meeting(
+        source_share=forward.met / forward.points,
+        target_share=backward.met / backward.points,
+        agreement=agreement,
+        likeness=min(agreement / alike, MOST_ALIKE),
+        tightness=float(np.median(beside)) if len(beside) else CLOSE,
+        turning=float(np.median(turning)) if len(turning) else 1.0,
+        violation=violation,
+        conflict=violation / max(share, 0.01),
+        voxels=min(
+            round(forward.agreed / forward.points * len(source.points)),
+            round(backward.agreed / backward.points * len(target.points)),
+        ),
+    )
+
+
+def _self_agreement(surface: Surface) -> float:
+    """Share of a scan's points whose neighbour in the same scan agrees, as ``meet`` asks of another's."""
+    chosen = slice(None, None, max(1, len(surface.points) // SAMPLES))
+    points, normals = surface.points[chosen], surface.normals[chosen]
+    distance, index = surface.tree.query(points, k=[NEXT + 1], distance_upper_bound=MEETING * surface.voxel)
+    near = np.isfinite(distance[:, 0])
+    index, points, normals = index[near, 0], points[near], normals[near]
+    if not len(points):
+        return 0.0
+    beside = np.abs(np.einsum("nd,nd->n", surface.points[index] - points, surface.normals[index]))
+    cosine = np.einsum("nd,nd->n", normals, surface.normals[index])
+    return float(((beside < CLOSE * surface.voxel) & (cosine > AGREEING)).mean())
+
+
+@dataclass(frozen=True)
+class _Way:
+    points: int
+    met: int
+    agreed: int
+    beside: np.ndarray
+    turning: np.ndarray
+    violation: float
+
+
+def _one_way(moving: Surface, fixed: Surface, T: np.ndarray) -> _Way:
+    stride = max(1, len(moving.points) // SAMPLES)
+    moved = rigid.apply(T, moving.points[::stride])
+    turned = moving.normals[::stride] @ T[:3, :3].T
+    distance, index = fixed.tree.query(moved, distance_upper_bound=MEETING * fixed.voxel)
+    met = np.isfinite(distance)
+    index = index[met]
+    plane = fixed.normals[index]
+    beside = np.abs(np.einsum("nd,nd->n", fixed.points[index] - moved[met], plane)) / fixed.voxel
+    cosine = np.einsum("nd,nd->n", turned[met], plane)
+    agreed = (beside < CLOSE) & (cosine > AGREEING)
+    return _Way(
+        points=len(moved),
+        met=int(met.sum()),
+        agreed=int(agreed.sum()),
+        beside=beside[agreed],
+        turning=1.0 - cosine,
+        violation=float(fixed.depth_map.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean()),
+    )

@@ -1,0 +1,7 @@
+"""One alignment as a self-contained HTML page: the verdict, a 3D view, the numbers."""
+
+from __future__ import annotations
+
+from utopic_cli.page.align import render
+
+__all__ = ["render"]

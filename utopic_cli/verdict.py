@@ -1,0 +1,156 @@
+"""The verdict: how likely the answer is right, whether to trust it, and why, in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from utopic_cli.errors import InputError
+from utopic_cli.estimation.confidence import Calibration
+from utopic_cli.geometry.rigid import relative_rotation_error_deg
+from utopic_cli.result import FreeMotion, Observability
+
+UNCALIBRATED = "these weights carry no calibration, so nothing says how far to trust them: look at the result"
+
+UNIT_MISMATCH = 8.0
+"""Extents that differ by more than this factor are named as a likely mix-up of units."""
+
+LITTLE_OVERLAP = 0.1
+"""Below this share of points with a counterpart, even a right answer can't be told from chance."""
+
+DIFFERENT_SURFACES = 0.6
+"""Likeness below this: where the scans meet, their surfaces differ."""
+
+CONFLICT = 0.03
+"""More of the scans than this, for what of them meets, standing in the other's empty space, is a lot."""
+
+FEW_EXPLAINED = -1.2
+"""A log10 of the share of matches explained below this is what wrong answers reach."""
+
+APART = -1.5
+"""Two answers farther apart than this (log10 of the share of the size) are different answers."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of an answer.
+
+    Attributes:
+        confidence: calibrated probability that it is right; None without a calibration.
+        trusted: whether to rely on it; never without a calibration.
+        reasons: why, most telling first.
+    """
+
+    confidence: float | None
+    trusted: bool
+    reasons: tuple[str, ...]
+
+
+def read_calibration(card: dict[str, Any]) -> Calibration | None:
+    """Return the calibration of a weights' card, or None if it has none.
+
+    Raises:
+        InputError: it can't be used.
+    """
+    section = card.get("calibration")
+    if section is None:
+        return None
+    try:
+        return Calibration.from_dict(section)
+    except ValueError as error:
+        raise InputError(f"{card.get('name', 'weights')}: {error}") from error
+
+
+def judge(
+    calibration: Calibration | None,
+    signals: dict[str, float],
+    transformation: np.ndarray,
+    rivals: Sequence[np.ndarray],
+    observability: Observability | None,
+    overlap_ratio: dict[str, float],
+    size_ratio: float = 1.0,
+) -> Verdict:
+    """Weigh the signals.
+
+    Args:
+        calibration: of the weights, or None.
+        signals: by name; see ``estimation.evidence.Evidence``.
+        transformation: (4, 4) the answer.
+        rivals: (4, 4) transformations that fit nearly as well.
+        observability: which motions the overlap fixes.
+        overlap_ratio: share of points with a counterpart, keys ``source`` and ``target``.
+        size_ratio: extent of the larger scan over that of the smaller one.
+    """
+    doubts = _doubts(signals, transformation, rivals, observability, overlap_ratio)
+    if size_ratio >= UNIT_MISMATCH:
+        doubts.insert(0, size_in_words(size_ratio))
+    if calibration is None:
+        return Verdict(None, False, (UNCALIBRATED, *doubts))
+    confidence = calibration.probability(signals)
+    if confidence >= calibration.threshold:
+        return Verdict(confidence, True, (_praise(signals, rivals), *doubts))
+    if not doubts:
+        doubts = [
+            f"no single sign is bad, but together they fall short of the {calibration.threshold:.0%} "
+            "from which an answer is trusted"
+        ]
+    return Verdict(confidence, False, tuple(doubts))
+
+
+def _praise(signals: dict[str, float], rivals: Sequence[np.ndarray]) -> str:
+    share = min(signals["likeness"], 1.0)
+    alone = "" if rivals else ", and no other transformation comes near"
+    return (
+        f"where the scans meet, the surfaces agree ({share:.0%} of what one scan agrees with itself){alone}"
+    )
+
+
+def _doubts(
+    signals: dict[str, float],
+    transformation: np.ndarray,
+    rivals: Sequence[np.ndarray],
+    observability: Observability | None,
+    overlap_ratio: dict[str, float],
+) -> list[str]:
+    """Say what speaks against the answer, most telling first."""
+    doubts = []
+    name, share = min(overlap_ratio.items(), key=lambda item: item[1])
+    if share < LITTLE_OVERLAP:
+        doubts.append(f"only {share:.0%} of the {name} finds a counterpart")
+    if observability is None:
+        doubts.append("too few points lie on each other to tell which motions are determined")
+    elif observability.free:
+        said = " and ".join(motion_in_words(motion) for motion in observability.free)
+        doubts.append(f"symmetric: {said} {'is' if len(observability.free) == 1 else 'are'} not determined")
+    if rivals:
+        count = "two poses fit" if len(rivals) == 1 else f"{len(rivals) + 1} poses fit"
+        angles = [relative_rotation_error_deg(rival, transformation) for rival in rivals]
+        doubts.append(f"{count} about equally well, {max(angles):.0f}° apart: see ambiguous_with")
+    if signals["likeness"] < DIFFERENT_SURFACES:
+        doubts.append(
+            f"where the scans meet their surfaces differ: they agree on {signals['likeness']:.0%} of what "
+            "one scan agrees with itself"
+        )
+    if signals["conflict"] > CONFLICT:
+        doubts.append("parts of one scan stand where the other saw empty space")
+    if signals["spread"] > APART:
+        doubts.append("another sampling of the same scans gave another answer")
+    if signals["support"] < FEW_EXPLAINED:
+        share = 10.0 ** signals["support"]
+        doubts.append(f"the answer explains only {share:.1%} of what the network matched")
+    return doubts
+
+
+def size_in_words(ratio: float) -> str:
+    """Say that two scans' sizes differ by a factor, and what that may mean."""
+    units = ": millimetres against metres?" if 300 < ratio < 3000 else ": are both in the same unit?"
+    return f"the scans' sizes differ by a factor of about {ratio:.0f}{units}"
+
+
+def motion_in_words(motion: FreeMotion) -> str:
+    """Name a motion of the source by kind and axis, e.g. ``rotation about the axis (0, 0, 1)``."""
+    axis = ", ".join(f"{value:.2f}".rstrip("0").rstrip(".") for value in np.round(motion.axis, 2) + 0.0)
+    return f"{'rotation about the axis' if motion.kind == 'rotation' else 'sliding along'} ({axis})"
