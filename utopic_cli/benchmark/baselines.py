@@ -3,7 +3,7 @@
 Open3D's global registration as its tutorial has it: voxel grid v, normals within 2 v, FPFH
 within 5 v, then RANSAC over feature matches or fast global registration (FGR), then
 point-to-plane ICP. The voxel size is the user's business there; here it is a fixed share of
-the pair's extent, which is more help than Open3D itself gives.
+the pair's extent, which is more help than Open3D itself gives. KISS-Matcher stands in `kiss`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from utopic_cli.benchmark.kiss import KissMatcher
 from utopic_cli.benchmark.method import Method, Trial
 from utopic_cli.errors import UsageError
 from utopic_cli.point_cloud import PointCloud
@@ -118,6 +119,7 @@ BASELINES: dict[str, Method] = {
         Open3DGlobal("open3d-ransac", "ransac", voxels_per_extent=50, iterations=100_000),
         Open3DGlobal("open3d-ransac-fine", "ransac", voxels_per_extent=120, iterations=2_000_000),
         Open3DGlobal("open3d-fgr", "fgr", voxels_per_extent=50, iterations=64),
+        KissMatcher(),
     )
 }
 
@@ -126,14 +128,15 @@ def find_baselines(names: Sequence[str]) -> tuple[Method, ...]:
     """Look baselines up by name, and make sure before any work that they can run.
 
     Raises:
-        UsageError: a name is unknown (the known ones are listed), or Open3D is missing.
+        UsageError: a name is unknown (the known ones are listed), or a library is missing.
     """
     for name in names:
         if name not in BASELINES:
             raise UsageError(f"unknown baseline {name!r}; known: {', '.join(BASELINES)}")
-    if names:
-        load_open3d()
-    return tuple(BASELINES[name] for name in dict.fromkeys(names))
+    chosen = tuple(BASELINES[name] for name in dict.fromkeys(names))
+    for method in chosen:
+        method.settings()  # loads its library
+    return chosen
 
 
 def load_open3d() -> Any:

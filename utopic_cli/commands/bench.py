@@ -41,7 +41,7 @@ def scans(
         str,
         typer.Option(
             metavar="NAME,..",
-            help="Methods to measure beside: open3d-ransac, open3d-ransac-fine, open3d-fgr.",
+            help="Methods to measure beside: open3d-ransac, open3d-ransac-fine, open3d-fgr, kiss-matcher.",
         ),
     ] = "",
     through_cli: Annotated[
@@ -80,7 +80,7 @@ def scans(
             min_overlap=min_overlap,
             through_cli=through_cli,
             options=AlignOptions(weights=weights, device=device, threads=threads, seed=seed),
-            progress=_countdown(step),
+            progress=countdown(step),
         )
     if json_out is not None:  # before anything that stdout could spoil
         write_atomically(json_out, report.to_json().encode("utf-8"), overwrite=overwrite)
@@ -228,7 +228,7 @@ def _measure(asked: _Asked, make_protocol: Callable[[], AnyProtocol]) -> None:
 
         check_baselines(baselines)
         step("making shapes" if asked.data == "procedural" else f"reading shapes from {asked.data}")
-        shapes = open_shapes(asked.data, progress=_countdown(step))
+        shapes = open_shapes(asked.data, progress=countdown(step))
         step("starting")
         report = run(
             make_protocol(),
@@ -241,7 +241,7 @@ def _measure(asked: _Asked, make_protocol: Callable[[], AnyProtocol]) -> None:
             workers=asked.workers,
             points=asked.points,
             device=asked.device,
-            progress=_countdown(step),
+            progress=countdown(step),
         )
     if asked.json_out is not None:  # before anything that stdout could spoil
         write_atomically(asked.json_out, report.to_json().encode("utf-8"), overwrite=asked.overwrite)
@@ -269,7 +269,7 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _countdown(step: Callable[[str], None]) -> Callable[[int, int, str], None]:
+def countdown(step: Callable[[str], None]) -> Callable[[int, int, str], None]:
     """Say how much is done and about how long the rest takes, at the pace so far."""
     begin = time.monotonic()
 
