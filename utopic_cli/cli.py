@@ -16,6 +16,8 @@ from typer.core import TyperGroup
 from utopic_cli import __version__
 from utopic_cli.commands.align import align
 from utopic_cli.commands.bench import bench
+from utopic_cli.commands.bench_confidence import confidence
+from utopic_cli.commands.calibrate import calibrate
 from utopic_cli.commands.console import debug_wanted
 from utopic_cli.commands.demo import demo
 from utopic_cli.commands.info import info
@@ -74,7 +76,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 aligned; 1 a bug of ours; 2 usage; 3 aligned, do not trust it; "
-    "4 an input can't be used; 5 an output can't be written; 130 interrupted.",
+    "4 an input can't be used; 5 an output can't be written; 6, 7 batch: in parts, nothing aligned; "
+    "130 interrupted.",
 )
 
 
@@ -104,6 +107,8 @@ app.command()(align)
 app.command()(demo)
 app.command()(info)
 app.command()(train)
+app.command()(calibrate)
+bench.command()(confidence)
 app.add_typer(bench, name="bench")
 
 
