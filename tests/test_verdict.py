@@ -32,7 +32,10 @@ def verdict(signals: dict[str, float] | None = None, rivals: Any = (), seen: Any
 def test_a_clear_answer_is_trusted_and_says_why() -> None:
     found = verdict()
     assert found.trusted and found.confidence == pytest.approx(1.0 / (1.0 + np.exp(-2.5)))
-    assert len(found.reasons) == 1 and "the surfaces agree" in found.reasons[0]
+    assert (
+        len(found.reasons) == 1
+        and "their surfaces agree as well as one scan does with itself, and no other" in found.reasons[0]
+    )
 
 
 def test_confidence_under_the_threshold_is_not_trusted() -> None:
@@ -49,7 +52,7 @@ def test_without_a_calibration_nothing_is_trusted() -> None:
 @pytest.mark.parametrize(
     ("signals", "said"),
     [
-        ({"likeness": 0.4}, "where the scans meet their surfaces differ: they agree on 40%"),
+        ({"likeness": 0.4}, "where the scans meet, their surfaces agree only 40% as well"),
         ({"conflict": 0.2}, "stand where the other saw empty space"),
         ({"spread": -0.4}, "another sampling of the same scans gave another answer"),
         ({"support": -2.0}, "explains only 1.0% of what the network matched"),
@@ -101,7 +104,18 @@ def test_sizes_that_differ_like_units_come_first() -> None:
 
 def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
     found = verdict({"conflict": 0.2})
-    assert found.trusted and len(found.reasons) == 2 and "empty space" in found.reasons[1]
+    assert found.trusted and len(found.reasons) == 2
+    assert found.reasons[1] == "against it: parts of one scan stand where the other saw empty space"
+    (praise, doubt) = verdict({"likeness": 0.5}).reasons
+    assert praise == "taken together, the signs speak for it" and "agree only 50% as well" in doubt
+
+
+def test_a_motion_left_free_is_never_trusted_however_likely_the_answer() -> None:
+    turn = FreeMotion("rotation", np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    free = Observability(np.zeros(6), (turn,), np.eye(6), np.zeros(3), 500)
+    for seen in (free, None):
+        found = verdict(seen=seen)
+        assert not found.trusted and found.confidence == verdict().confidence
 
 
 def test_a_card_without_a_calibration_has_none_and_a_damaged_one_is_an_error() -> None:

@@ -29,8 +29,8 @@ from utopic_cli.verdict import UNIT_MISMATCH, judge, read_calibration, size_in_w
 FEWEST_NODES = 50
 """The network sees at least this many points of a scan that has them."""
 
-RIVAL_SHARE = 0.85
-"""A distinct pose with more than this share of the best one's score is named as a rival."""
+RIVAL_LAG = 0.1
+"""A distinct pose whose standing is behind the best one's by less than this is named as a rival."""
 
 COUNTERPART_REACH = 3.0
 """A point has a counterpart within this many spacings of the sparser scan."""
@@ -145,7 +145,7 @@ def _register(
     rivals = tuple(
         prepared.denormalise(rival.T_target_source)
         for rival in estimate.rivals
-        if rival.score > RIVAL_SHARE * estimate.score
+        if estimate.best.standing - rival.standing < RIVAL_LAG
     )
     clock.start("carry to all points")
     source_all = _carry(

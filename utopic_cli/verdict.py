@@ -40,7 +40,7 @@ class Verdict:
 
     Attributes:
         confidence: calibrated probability that it is right; None without a calibration.
-        trusted: whether to rely on it; never without a calibration.
+        trusted: whether to rely on it; never without a calibration, nor where a motion is left free.
         reasons: why, most telling first.
     """
 
@@ -90,8 +90,12 @@ def judge(
     if calibration is None:
         return Verdict(None, False, (UNCALIBRATED, *doubts))
     confidence = calibration.probability(signals)
-    if confidence >= calibration.threshold:
-        return Verdict(confidence, True, (_praise(signals, rivals), *doubts))
+    # Along a motion that the surfaces leave free, even a likely answer is right by luck alone.
+    undetermined = observability is None or bool(observability.free)
+    if confidence >= calibration.threshold and not undetermined:
+        return Verdict(
+            confidence, True, (_praise(signals, rivals), *(f"against it: {one}" for one in doubts))
+        )
     if not doubts:
         doubts = [
             f"no single sign is bad, but together they fall short of the {calibration.threshold:.0%} "
@@ -101,11 +105,12 @@ def judge(
 
 
 def _praise(signals: dict[str, float], rivals: Sequence[np.ndarray]) -> str:
-    share = min(signals["likeness"], 1.0)
+    likeness = signals["likeness"]
+    if likeness < DIFFERENT_SURFACES:
+        return "taken together, the signs speak for it"
+    share = "as well as" if likeness >= 1.0 else f"{likeness:.0%} as well as"
     alone = "" if rivals else ", and no other transformation comes near"
-    return (
-        f"where the scans meet, the surfaces agree ({share:.0%} of what one scan agrees with itself){alone}"
-    )
+    return f"where the scans meet, their surfaces agree {share} one scan does with itself{alone}"
 
 
 def _doubts(
@@ -131,8 +136,8 @@ def _doubts(
         doubts.append(f"{count} about equally well, {max(angles):.0f}° apart: see ambiguous_with")
     if signals["likeness"] < DIFFERENT_SURFACES:
         doubts.append(
-            f"where the scans meet their surfaces differ: they agree on {signals['likeness']:.0%} of what "
-            "one scan agrees with itself"
+            f"where the scans meet, their surfaces agree only {signals['likeness']:.0%} as well as one scan "
+            "does with itself"
         )
     if signals["conflict"] > CONFLICT:
         doubts.append("parts of one scan stand where the other saw empty space")
