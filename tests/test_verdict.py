@@ -103,11 +103,17 @@ def test_sizes_that_differ_like_units_come_first() -> None:
 
 
 def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
-    found = verdict({"conflict": 0.2})
+    found = verdict({"conflict": 0.05})
     assert found.trusted and len(found.reasons) == 2
     assert found.reasons[1] == "against it: parts of one scan stand where the other saw empty space"
     (praise, doubt) = verdict({"likeness": 0.5}).reasons
     assert praise == "taken together, the signs speak for it" and "agree only 50% as well" in doubt
+
+
+def test_scans_that_contradict_each_other_are_never_trusted_however_likely_the_answer() -> None:
+    found = verdict({"conflict": 0.2})
+    assert not found.trusted and found.confidence == verdict().confidence
+    assert found.reasons == ("parts of one scan stand where the other saw empty space",)
 
 
 def test_a_motion_left_free_is_never_trusted_however_likely_the_answer() -> None:

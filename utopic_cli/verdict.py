@@ -27,6 +27,10 @@ DIFFERENT_SURFACES = 0.6
 CONFLICT = 0.03
 """More of the scans than this, for what of them meets, standing in the other's empty space, is a lot."""
 
+MOST_CONFLICT = 0.1
+"""With more of it an answer is not trusted, whatever else speaks for it: one right answer in a hundred has
+as much, and nothing else tells a body from its mirror image where most of it is symmetric."""
+
 FEW_EXPLAINED = -1.2
 """A log10 of the share of matches explained below this is what wrong answers reach."""
 
@@ -40,7 +44,8 @@ class Verdict:
 
     Attributes:
         confidence: calibrated probability that it is right; None without a calibration.
-        trusted: whether to rely on it; never without a calibration, nor where a motion is left free.
+        trusted: whether to rely on it; never without a calibration, nor where a motion is left free
+            or the scans contradict each other.
         reasons: why, most telling first.
     """
 
@@ -92,7 +97,8 @@ def judge(
     confidence = calibration.probability(signals)
     # Along a motion that the surfaces leave free, even a likely answer is right by luck alone.
     undetermined = observability is None or bool(observability.free)
-    if confidence >= calibration.threshold and not undetermined:
+    refuted = signals["conflict"] > MOST_CONFLICT
+    if confidence >= calibration.threshold and not undetermined and not refuted:
         return Verdict(
             confidence, True, (_praise(signals, rivals), *(f"against it: {one}" for one in doubts))
         )

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from utopic_cli.benchmark import trials
 from utopic_cli.benchmark.labelled import Trial
 from utopic_cli.benchmark.solids import SYMMETRIC, box, extruded, joined, revolved
-from utopic_cli.benchmark.trial_scans import MIRRORED_APART, mirror_distance
+from utopic_cli.benchmark.trial_scans import CLEARLY_APART, mirror_distance, turned_distance
 from utopic_cli.benchmark.trial_solids import seen_from_within
 from utopic_cli.benchmark.trials import KINDS, bench_half, calibration_half, trial
 from utopic_cli.errors import InputError, UsageError
@@ -145,7 +145,29 @@ def test_one_shape_is_no_two_different_ones(shapes, monkeypatch):
 def test_symmetric_solids_equal_their_mirror_image(name):
     rng = np.random.default_rng(5)
     mesh = SYMMETRIC[name][0](rng)
-    assert mirror_distance(sample_surface(*mesh, 12_000, rng)[0], rng) < 0.3 * MIRRORED_APART
+    assert mirror_distance(sample_surface(*mesh, 12_000, rng)[0], rng) < 0.3 * CLEARLY_APART
+
+
+@pytest.mark.parametrize("name", ["cylinder", "torus", "cube", "box", "hexagonal prism", "gear"])
+def test_symmetric_solids_equal_themselves_turned(name):
+    rng = np.random.default_rng(5)
+    mesh = SYMMETRIC[name][0](rng)
+    assert turned_distance(sample_surface(*mesh, 12_000, rng)[0], rng) < 0.3 * CLEARLY_APART
+
+
+def test_a_mirror_plane_is_no_turn():
+    rng = np.random.default_rng(6)
+    body = box(np.array([0.6, 0.4, 0.2]))
+    tower = box(np.array([0.15, 0.4, 0.3]))[0] + np.array([0.4, 0.0, 0.4])
+    chair = sample_surface(*joined(body, (tower, body[1])), 12_000, rng)[0]
+    assert mirror_distance(chair, rng) < 0.3 * CLEARLY_APART < CLEARLY_APART < turned_distance(chair, rng)
+
+
+def test_disjoint_scans_are_of_shapes_that_no_turn_maps_onto_themselves(shapes, monkeypatch):
+    monkeypatch.setattr(trials.trial_scans, "turned_distance", lambda points, rng: 0.0)
+    monkeypatch.setattr(trials, "ATTEMPTS", 2)
+    with pytest.raises(DegeneratePair, match="when turned"):
+        trial(shapes, 8, 0, ("disjoint",))
 
 
 def test_a_shape_with_a_hand_differs_from_its_mirror_image():
@@ -156,10 +178,10 @@ def test_a_shape_with_a_hand_differs_from_its_mirror_image():
         for size, place in ((0.2, (0.5, 0.3, 0.3)), (0.15, (-0.4, 0.35, 0.0)), (0.1, (0.1, -0.3, 0.25)))
     ]
     chiral = sample_surface(*joined(body, *knobs), 12_000, rng)[0]
-    assert mirror_distance(chiral, rng) > MIRRORED_APART
+    assert mirror_distance(chiral, rng) > CLEARLY_APART
     # One with a mirror plane that no principal axis names: two boxes side by side, at 45 degrees.
     both = joined(body, (body[0][:, [1, 0, 2]] + np.array([0.0, 0.0, 0.4]), body[1][:, ::-1]))
-    assert mirror_distance(sample_surface(*both, 12_000, rng)[0], rng) < 0.3 * MIRRORED_APART
+    assert mirror_distance(sample_surface(*both, 12_000, rng)[0], rng) < 0.3 * CLEARLY_APART
 
 
 def test_mirrored_scans_are_of_shapes_that_differ_from_their_mirror_image(shapes, monkeypatch):
@@ -172,7 +194,7 @@ def test_mirrored_scans_are_of_shapes_that_differ_from_their_mirror_image(shapes
     )
     for number in range(2):
         trial(shapes, 2, number, ("mirrored",))
-        assert measured[-1] >= MIRRORED_APART
+        assert measured[-1] >= CLEARLY_APART
     # A shape that equals its mirror image, however it is warped, is no wrong pair.
     monkeypatch.setattr(trials.trial_scans, "mirror_distance", lambda points, rng: 0.0)
     monkeypatch.setattr(trials, "ATTEMPTS", 2)

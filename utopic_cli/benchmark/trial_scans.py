@@ -33,9 +33,9 @@ LEAST_POINTS = 500
 GAP: Range = (0.02, 0.06)
 """Width of the gap between disjoint scans, in extents of the object."""
 
-MIRRORED_APART = 0.01
-"""A shape is told from its mirror image if, laid on it as well as can be, the points of the one are
-on average farther from the other than this share of the extent."""
+CLEARLY_APART = 0.01
+"""A shape is told from its mirror image, or from itself turned, if, laid on it as well as can be, the
+points of the one are on average farther from the other than this share of the extent."""
 
 
 def scans(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
@@ -80,15 +80,28 @@ def little(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
 def disjoint(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
     """Two scans of one object that share no surface: its opposite sides, or its two ends.
 
-    Whatever of the target lies nearer to the source than a gap is taken away.
+    Whatever of the target lies nearer to the source than a gap is taken away. Opposite sides of what
+    a turn maps onto itself look like one side seen twice, which is no wrong pair but an unknowable
+    one; the kind ``symmetric`` has such things. Here they are stretched and strongly warped first, and
+    left out if that leaves them symmetric.
     """
     shape = shapes.draw(rng)
+    bent = replace(
+        SETTINGS,
+        minimum_overlap=0.0,
+        stretch_probability=1.0,
+        warp_probability=1.0,
+        warp_strength=(0.03, 0.06),
+    )
     if rng.random() < 0.6:
-        settings = replace(SETTINGS, minimum_overlap=0.0, view_angle=(110.0, 180.0))
-        pair = range_scan_pair(shapes.mesh(shape), rng, settings, (0.0, 0.05))
+        settings = replace(bent, view_angle=(110.0, 180.0))
+        pair = range_scan_pair(shapes.mesh(shape), rng, settings, (0.0, 0.05), whole=True)
     else:
-        settings = replace(SETTINGS, minimum_overlap=0.0, patch_keep=(0.25, 0.45))
-        pair = patch_pair(shapes.mesh(shape), rng, settings)
+        settings = replace(bent, patch_keep=(0.25, 0.45))
+        pair = patch_pair(shapes.mesh(shape), rng, settings, whole=True)
+    assert pair.object_points is not None  # asked for
+    if turned_distance(pair.object_points, rng) < CLEARLY_APART:
+        raise DegeneratePair("the shape is all but itself when turned")
     there = apply(pair.gt_T_target_source, pair.source.points)
     # No gap is narrower than the reach within which overlap is measured.
     spacings = [np.median(cKDTree(cloud).query(cloud[:300], k=2)[0][:, 1]) for cloud in _clouds(pair, there)]
@@ -134,7 +147,7 @@ def mirrored(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
     settings = replace(SETTINGS, stretch_probability=1.0, warp_probability=1.0, warp_strength=(0.03, 0.06))
     pair = range_scan_pair(shapes.mesh(shape), rng, settings, BANDS[rng.integers(3)], whole=True)
     assert pair.object_points is not None  # asked for
-    if mirror_distance(pair.object_points, rng) < MIRRORED_APART:
+    if mirror_distance(pair.object_points, rng) < CLEARLY_APART:
         raise DegeneratePair("the shape is all but its own mirror image")
     reflection = np.array([-1.0, 1.0, 1.0])  # any will do: the source's frame is a random one
     source = PointCloud(pair.source.points * reflection)
@@ -144,8 +157,6 @@ def mirrored(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
 def mirror_distance(points: np.ndarray, rng: np.random.Generator) -> float:
     """Tell how far a surface is from its mirror image, laid on it as well as can be.
 
-    Mirrored and turned in its principal axes' frame to many starts, then moved by nearest points.
-
     Args:
         points: (N, 3) sample of the whole surface, dense.
         rng: draws the points compared.
@@ -154,19 +165,46 @@ def mirror_distance(points: np.ndarray, rng: np.random.Generator) -> float:
         Mean distance to the nearest point, less what two samples of one surface have anyway, as a
         share of the extent.
     """
+    starts = [np.diag(signs) for signs in ((-1.0, 1, 1), (1, -1.0, 1), (1, 1, -1.0), (-1.0, -1.0, -1.0))]
+    # Two axes may be as good as any other two: then the plane may stand at any angle to them.
+    half_turn = np.diag([1.0, -1.0])
+    starts += [
+        _about(axis, _turn(angle) @ half_turn) for axis in range(3) for angle in np.arange(1, 6) * 30.0
+    ]
+    return _self_distance(points, starts, rng)
+
+
+def turned_distance(points: np.ndarray, rng: np.random.Generator) -> float:
+    """Tell how far a surface is from itself, turned by 60 degrees or more and laid on itself.
+
+    Arguments and result are those of ``mirror_distance``.
+    """
+    angles = (60.0, 72.0, 90.0, 120.0, 144.0, 180.0)
+    return _self_distance(points, [_about(axis, _turn(angle)) for axis in range(3) for angle in angles], rng)
+
+
+def _turn(angle_deg: float) -> np.ndarray:
+    angle = np.radians(angle_deg)
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _about(axis: int, plane: np.ndarray) -> np.ndarray:
+    """Let a (2, 2) map act across an axis."""
+    whole = np.eye(3)
+    across = [(axis + 1) % 3, (axis + 2) % 3]
+    whole[np.ix_(across, across)] = plane
+    return whole
+
+
+def _self_distance(points: np.ndarray, starts: list[np.ndarray], rng: np.random.Generator) -> float:
+    """Lay a surface on itself from many starts (3, 3) in its principal axes' frame, by nearest points."""
     few = points[rng.permutation(len(points))[:4000]].astype(np.float64)
     few = few - few.mean(axis=0)
     few = few @ np.linalg.eigh(few.T @ few)[1]
     probe, tree = few[:500], cKDTree(few[500:])
-    starts = [np.diag(signs) for signs in ((-1.0, 1, 1), (1, -1.0, 1), (1, 1, -1.0), (-1.0, -1.0, -1.0))]
-    # Two axes may be as good as any other two: then the plane may stand at any angle to them.
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        for angle in np.arange(1, 6) * np.pi / 6.0:
-            turn = np.eye(3)
-            turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), np.sin(angle), np.sin(angle), -np.cos(angle)
-            starts.append(turn)
     laid = [_laid_on(tree, probe[:150], start, np.zeros(3), steps=6) for start in starts]
+    # What slid back to where it came from says nothing: every surface lies on itself.
+    laid = [(turn, shift) for turn, shift in laid if np.trace(turn) < 1.0 + 2.0 * np.cos(np.radians(40.0))]
     rough = [tree.query(probe[:150] @ turn.T + shift)[0].mean() for turn, shift in laid]
     best = np.inf
     for number in np.argsort(rough)[:3]:
@@ -178,9 +216,9 @@ def mirror_distance(points: np.ndarray, rng: np.random.Generator) -> float:
 def _laid_on(
     tree: cKDTree, probe: np.ndarray, turn: np.ndarray, shift: np.ndarray, *, steps: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move a mirrored surface onto itself by nearest points; ``turn`` (3, 3) stays a reflection."""
+    """Move a surface onto itself by nearest points; ``turn`` (3, 3) stays a rotation or a reflection."""
     centre = probe.mean(axis=0)
-    mirror = np.array([-1.0, 1.0, 1.0])
+    mirror = np.array([np.sign(np.linalg.det(turn)), 1.0, 1.0])
     for _ in range(steps):
         there = tree.data[tree.query(probe @ turn.T + shift)[1]]
         centre_there = there.mean(axis=0)

@@ -139,7 +139,10 @@ def load_library(data: str, console: Console) -> ShapeLibrary:
 
 def describe_files(out: Path, weights: Path) -> list[str]:
     """Say where everything is that a run left, one line each."""
-    lines = [f"wrote {weights}; use it: utopic align SOURCE TARGET --weights {weights}"]
+    lines = [
+        f"wrote {weights}; use it: utopic align SOURCE TARGET --weights {weights}",
+        f"so that its answers can be trusted: utopic calibrate {weights}",
+    ]
     if (out / "curves.html").is_file():
         lines.append(f"curves: {out / 'curves.html'}")
     if (out / "tensorboard").is_dir():
