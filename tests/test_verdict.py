@@ -14,7 +14,7 @@ from utopic_cli.geometry import rigid
 from utopic_cli.result import FreeMotion, Observability
 from utopic_cli.verdict import UNCALIBRATED, judge, motion_in_words, read_calibration
 
-GOOD = {"likeness": 1.0, "conflict": 0.0, "spread": SAME, "support": -0.6, "lead": 0.5}
+GOOD = {"likeness": 1.0, "conflict": -2.5, "spread": SAME, "support": -0.6, "lead": 0.5, "fixed": -1.0}
 FIXED = Observability(np.full(6, 0.3), (), np.eye(6), np.zeros(3), 500)
 
 
@@ -53,7 +53,7 @@ def test_without_a_calibration_nothing_is_trusted() -> None:
     ("signals", "said"),
     [
         ({"likeness": 0.4}, "where the scans meet, their surfaces agree only 40% as well"),
-        ({"conflict": 0.2}, "stand where the other saw empty space"),
+        ({"conflict": -0.7}, "stand where the other saw empty space"),
         ({"spread": -0.4}, "another sampling of the same scans gave another answer"),
         ({"support": -2.0}, "explains only 1.0% of what the network matched"),
     ],
@@ -103,7 +103,7 @@ def test_sizes_that_differ_like_units_come_first() -> None:
 
 
 def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
-    found = verdict({"conflict": 0.05})
+    found = verdict({"conflict": -1.3})
     assert found.trusted and len(found.reasons) == 2
     assert found.reasons[1] == "against it: parts of one scan stand where the other saw empty space"
     (praise, doubt) = verdict({"likeness": 0.5}).reasons
@@ -111,7 +111,7 @@ def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
 
 
 def test_scans_that_contradict_each_other_are_never_trusted_however_likely_the_answer() -> None:
-    found = verdict({"conflict": 0.2})
+    found = verdict({"conflict": -0.7})
     assert not found.trusted and found.confidence == verdict().confidence
     assert found.reasons == ("parts of one scan stand where the other saw empty space",)
 
@@ -120,8 +120,9 @@ def test_a_motion_left_free_is_never_trusted_however_likely_the_answer() -> None
     turn = FreeMotion("rotation", np.array([0.0, 0.0, 1.0]), np.zeros(3))
     free = Observability(np.zeros(6), (turn,), np.eye(6), np.zeros(3), 500)
     for seen in (free, None):
-        found = verdict(seen=seen)
+        found = verdict({"fixed": -4.0}, seen=seen)
         assert not found.trusted and found.confidence == verdict().confidence
+        assert found.reasons
 
 
 def test_a_card_without_a_calibration_has_none_and_a_damaged_one_is_an_error() -> None:

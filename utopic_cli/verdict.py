@@ -10,6 +10,7 @@ import numpy as np
 
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.confidence import Calibration
+from utopic_cli.estimation.observability import FREE
 from utopic_cli.geometry.rigid import relative_rotation_error_deg
 from utopic_cli.result import FreeMotion, Observability
 
@@ -24,10 +25,10 @@ LITTLE_OVERLAP = 0.1
 DIFFERENT_SURFACES = 0.6
 """Likeness below this: where the scans meet, their surfaces differ."""
 
-CONFLICT = 0.03
-"""More of the scans than this, for what of them meets, standing in the other's empty space, is a lot."""
+CONFLICT = -1.5
+"""Log10 of how much of the scans may stand in the other's empty space, for what of them meets."""
 
-MOST_CONFLICT = 0.1
+MOST_CONFLICT = -1.0
 """With more of it an answer is not trusted, whatever else speaks for it: one right answer in a hundred has
 as much, and nothing else tells a body from its mirror image where most of it is symmetric."""
 
@@ -69,6 +70,15 @@ def read_calibration(card: dict[str, Any]) -> Calibration | None:
         raise InputError(f"{card.get('name', 'weights')}: {error}") from error
 
 
+def ruled_out(signals: dict[str, float]) -> bool:
+    """Tell whether an answer is not to be trusted, however likely it is.
+
+    Along a motion that the surfaces leave free it is right by luck alone, and scans that contradict
+    each other can't both be right.
+    """
+    return signals["fixed"] < np.log10(FREE) or signals["conflict"] > MOST_CONFLICT
+
+
 def judge(
     calibration: Calibration | None,
     signals: dict[str, float],
@@ -95,10 +105,7 @@ def judge(
     if calibration is None:
         return Verdict(None, False, (UNCALIBRATED, *doubts))
     confidence = calibration.probability(signals)
-    # Along a motion that the surfaces leave free, even a likely answer is right by luck alone.
-    undetermined = observability is None or bool(observability.free)
-    refuted = signals["conflict"] > MOST_CONFLICT
-    if confidence >= calibration.threshold and not undetermined and not refuted:
+    if confidence >= calibration.threshold and not ruled_out(signals):
         return Verdict(
             confidence, True, (_praise(signals, rivals), *(f"against it: {one}" for one in doubts))
         )

@@ -11,6 +11,8 @@ from utopic_cli.benchmark import calibration
 from utopic_cli.benchmark.calibration import MOST_RISK, Outcome, calibrate, fit, outcome_of
 from utopic_cli.errors import InputError, UsageError
 
+FINE = {"fixed": -1.0, "conflict": -2.5}
+
 
 def outcomes(count: int, seed: int, steepness: float = 6.0) -> list[Outcome]:
     """Answers that are right with a probability that grows with their margin."""
@@ -19,7 +21,12 @@ def outcomes(count: int, seed: int, steepness: float = 6.0) -> list[Outcome]:
     right = rng.random(count) < 1.0 / (1.0 + np.exp(-steepness * margin))
     noise = rng.normal(size=count)
     return [
-        Outcome(i, "scans" if i % 3 else "disjoint", bool(right[i]), {"margin": margin[i], "noise": noise[i]})
+        Outcome(
+            i,
+            "scans" if i % 3 else "disjoint",
+            bool(right[i]),
+            {"margin": margin[i], "noise": noise[i], **FINE},
+        )
         for i in range(count)
     ]
 
@@ -43,6 +50,15 @@ def test_the_threshold_holds_on_other_outcomes() -> None:
     assert np.mean([not o.right for o in accepted]) < 3 * MOST_RISK
 
 
+def test_what_is_ruled_out_anyway_does_not_raise_the_threshold() -> None:
+    def accepted(fixed: float) -> float:
+        loud = {"margin": 1.0, "noise": 0.0, "fixed": fixed, "conflict": -2.5}
+        wrong = [Outcome(3000 + i, "symmetric", False, loud) for i in range(30)]
+        return fit(outcomes(3000, 4, 12.0) + wrong, {}).description["out_of_fold"]["right_accepted"]
+
+    assert accepted(-4.0) > 1.5 * accepted(-2.0)
+
+
 def test_the_clearer_the_signals_the_more_is_accepted() -> None:
     shares = [
         fit(outcomes(1000, 3, steepness), {}).description["out_of_fold"]["right_accepted"]
@@ -52,17 +68,17 @@ def test_the_clearer_the_signals_the_more_is_accepted() -> None:
 
 
 def test_where_the_surest_answer_is_wrong_nothing_is_trusted() -> None:
-    made = [Outcome(i, "scans", i % 2 == 0, {"margin": float(i % 2)}) for i in range(100)]
-    made[1] = Outcome(1, "scans", False, {"margin": -5.0})
+    made = [Outcome(i, "scans", i % 2 == 0, {"margin": float(i % 2), **FINE}) for i in range(100)]
+    made[1] = Outcome(1, "scans", False, {"margin": -5.0, **FINE})
     found = fit(made, {})
-    worst = max(found.probability({"margin": value}) for value in (-5.0, 0.0, 1.0))
+    worst = max(found.probability({"margin": value, **FINE}) for value in (-5.0, 0.0, 1.0))
     assert found.threshold > worst or found.description["out_of_fold"]["accepted_wrong"] <= MOST_RISK
 
 
 def test_too_few_or_one_sided_outcomes_are_refused() -> None:
     with pytest.raises(ValueError, match="only 12 trials"):
         fit(outcomes(12, 0), {})
-    right = [Outcome(i, "scans", True, {"margin": 1.0}) for i in range(50)]
+    right = [Outcome(i, "scans", True, {"margin": 1.0, **FINE}) for i in range(50)]
     with pytest.raises(ValueError, match="right answers and wrong ones"):
         fit(right, {})
 

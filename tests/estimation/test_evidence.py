@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import VOXEL, lumpy_surface, make_problem, view
-from utopic_cli.estimation.evidence import SAME, Evidence, Seen, collect_evidence
+from utopic_cli.estimation.evidence import (
+    MOST_MARGIN,
+    NO_CONFLICT,
+    NO_LEAD,
+    SAME,
+    Evidence,
+    Seen,
+    collect_evidence,
+)
 from utopic_cli.estimation.meeting import MOST_ALIKE, meet
 from utopic_cli.estimation.observability import observe
 from utopic_cli.estimation.solver import Estimate, solve
@@ -99,8 +107,9 @@ def test_every_signal_of_a_right_answer_is_finite_and_good(answered: tuple[Estim
     estimate, evidence = answered
     assert all(np.isfinite(value) for value in evidence.as_dict().values())
     assert evidence.score == estimate.score
-    assert evidence.lead > 0.2 and evidence.margin > 0.3 and evidence.support_lead > 0.3
+    assert evidence.lead > np.log10(0.2) and evidence.margin == MOST_MARGIN and evidence.support_lead > 0.3
     assert 10.0**evidence.support == pytest.approx(estimate.support)
+    assert evidence.conflict == pytest.approx(np.log10(NO_CONFLICT)) and evidence.completeness == 0.0
     assert evidence.seen_contrast > 0.2 and evidence.uncertainty == pytest.approx(0.02)
     assert evidence.fixed > -2.5 and evidence.spread == SAME
 
@@ -119,7 +128,7 @@ def test_a_rival_as_good_as_the_answer_takes_the_lead_away(
     problem = make_problem(*scans, gt_transformation, wrong=0.5)
     doubtful = evidence_of(problem, scans, dataclasses.replace(estimate, rivals=(twin,)))
     assert doubtful.margin == 0.0
-    assert doubtful.lead == pytest.approx(0.0) and doubtful.support_lead == pytest.approx(0.0)
+    assert doubtful.lead == pytest.approx(np.log10(NO_LEAD)) and doubtful.support_lead == pytest.approx(0.0)
 
 
 def test_no_rival_at_all_is_the_clearest_margin(
@@ -127,7 +136,7 @@ def test_no_rival_at_all_is_the_clearest_margin(
 ) -> None:
     problem = make_problem(*scans, gt_transformation, wrong=0.5)
     alone = evidence_of(problem, scans, dataclasses.replace(answered[0], rivals=()))
-    assert alone.margin == 1.0 and alone.lead >= answered[1].lead
+    assert alone.margin == MOST_MARGIN and alone.lead >= answered[1].lead
 
 
 def test_where_nothing_meets_the_signals_are_finite_all_the_same(

@@ -24,6 +24,7 @@ from utopic_cli.estimation.confidence import Calibration, fit_calibration
 from utopic_cli.pipeline import register
 from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.shapes import ShapeLibrary
+from utopic_cli.verdict import ruled_out
 
 MOST_RISK = 0.01
 """Of the answers that are trusted, at most this share is to be wrong, measured out of fold."""
@@ -110,10 +111,11 @@ def fit(outcomes: list[Outcome], about: dict[str, Any]) -> Calibration:
     values = np.array([[outcome.signals[name] for name in names] for outcome in outcomes])
     right = np.array([outcome.right for outcome in outcomes])
     unseen = _out_of_fold(names, values, right)
-    threshold = threshold_for(unseen, right, MOST_RISK)
+    acceptable = np.where([ruled_out(outcome.signals) for outcome in outcomes], 0.0, unseen)
+    threshold = threshold_for(acceptable, right, MOST_RISK)
     if threshold is None:  # the surest answer is wrong: only what is surer than all of them may pass
         threshold = 1.0
-    accepted = accepted_at(unseen, right, threshold)
+    accepted = accepted_at(acceptable, right, threshold)
     description = {
         **about,
         "answers": len(outcomes),

@@ -97,7 +97,9 @@ def _weights() -> dict[str, Any]:
             facts |= {key: value for key, value in card.items() if key not in ("sha256", "name")}
             facts["intact"] = card.get("sha256") == facts["sha256"]
             calibration = card.get("calibration")
-            facts["trusted_from"] = "never: not calibrated" if calibration is None else calibration["threshold"]
+            facts["trusted_from"] = (
+                "never: not calibrated" if calibration is None else calibration["threshold"]
+            )
         except InputError as error:
             facts["card"] = str(error)
         found[name] = facts

@@ -32,9 +32,13 @@ class Evidence:
         likeness: see ``Meeting``.
         tightness: see ``Meeting``; less is better.
         turning: see ``Meeting``; less is better.
-        conflict: see ``Meeting``; less is better.
-        margin: by how much the answer's standing (see ``Candidate``) exceeds that of its best rival.
-        lead: by how much the answer is more plausible (see ``Meeting``) than the most plausible rival.
+        conflict: log10 of that of ``Meeting``, from -2.5 (none) up; less is better.
+        completeness: 0 up to an overlap of .9, 1 where all of both scans meets: scans from different
+            sides share less, so it speaks for a symmetric thing seen from opposite ones; less is better.
+        margin: by how much the answer's standing (see ``Candidate``) exceeds that of its best rival; from
+            ``MOST_MARGIN`` on, more of it says no more.
+        lead: log10 of how much more plausible (see ``Meeting``) the answer is than the most plausible
+            rival, from -1.7 (not at all) up.
         support: log10 of the share of the correspondences' weight that the transformation explains.
         support_lead: log10 of that share over what the best supported rival explains.
         explained: natural logarithm of one plus the number of correspondences explained.
@@ -56,6 +60,7 @@ class Evidence:
     tightness: float
     turning: float
     conflict: float
+    completeness: float
     margin: float
     lead: float
     support: float
@@ -119,7 +124,8 @@ def collect_evidence(
         spread: see ``Evidence``.
     """
     meeting = meet(source, target, transformation)
-    rivals = [rival.plausibility for rival in estimate.rivals]
+    overlap = min(meeting.source_share, meeting.target_share)
+    lead = meeting.plausibility - max((rival.plausibility for rival in estimate.rivals), default=0.0)
     rival_support = max((rival.support for rival in estimate.rivals), default=0.0)
     reach = MEETING * source.voxel
     there = source.tree.query(rigid.apply(rigid.invert(transformation), seen.target))[0] < reach
@@ -130,14 +136,15 @@ def collect_evidence(
     support = np.log10(max(estimate.support, LEAST_SUPPORT))
     return Evidence(
         score=estimate.score,
-        overlap=min(meeting.source_share, meeting.target_share),
+        overlap=overlap,
         agreement=meeting.agreement,
         likeness=meeting.likeness,
         tightness=meeting.tightness,
         turning=meeting.turning,
-        conflict=meeting.conflict,
-        margin=estimate.margin,
-        lead=meeting.plausibility - max(rivals, default=0.0),
+        conflict=float(np.log10(meeting.conflict + NO_CONFLICT)),
+        completeness=max(overlap - 0.9, 0.0) / 0.1,
+        margin=min(estimate.margin, MOST_MARGIN),
+        lead=float(np.log10(max(lead, 0.0) + NO_LEAD)),
         support=float(support),
         support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
         explained=float(np.log1p(len(estimate.correspondences))),
@@ -153,6 +160,9 @@ def collect_evidence(
 
 
 MOST_RESIDUAL = 10.0
+MOST_MARGIN = 0.3
+NO_CONFLICT = 0.003
+NO_LEAD = 0.02
 
 
 def _smallest_eigenvalue(observability: Observability | None) -> float:
