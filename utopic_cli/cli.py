@@ -15,6 +15,7 @@ from typer.core import TyperGroup
 
 from utopic_cli import __version__
 from utopic_cli.commands.align import align
+from utopic_cli.commands.batch import batch
 from utopic_cli.commands.bench import bench
 from utopic_cli.commands.bench_confidence import confidence
 from utopic_cli.commands.calibrate import calibrate
@@ -104,6 +105,7 @@ def roof(
 
 
 app.command()(align)
+app.command()(batch)
 app.command()(demo)
 app.command()(info)
 app.command()(train)

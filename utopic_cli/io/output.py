@@ -6,8 +6,10 @@ import errno
 import os
 import secrets
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from utopic_cli.errors import OutputError
 
@@ -110,6 +112,34 @@ def write_together(contents: Mapping[Path, bytes], *, overwrite: bool) -> tuple[
         for temporary in temporaries.values():
             temporary.unlink(missing_ok=True)
     return tuple(new)
+
+
+@contextmanager
+def open_atomically(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
+    """Write a file too large to be made in memory, whole or not at all.
+
+    Yields:
+        A stream to write; the file takes its place when the block ends without an error.
+
+    Raises:
+        OutputError: the file exists (without ``overwrite``) or can't be written.
+    """
+    path = Path(path)
+    temporary = _temporary(_check_target(path, overwrite))
+    try:
+        with open(_create(temporary), "wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        target = _check_target(path, overwrite)
+        if overwrite:
+            os.replace(temporary, target)
+        else:
+            _rename_to_new(temporary, target)
+    except OSError as error:
+        raise _explained(path, error) from None
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _check_target(path: Path, overwrite: bool) -> Path:

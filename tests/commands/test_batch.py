@@ -1,0 +1,197 @@
+"""``utopic batch`` at the command line; the room itself is tested in tests/multiway."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.multiway.stubs import make_stub, random_motion, write_scans
+from utopic_cli.geometry.rigid import invert, relative_rotation_error_deg
+from utopic_cli.io.ply_writer import scalar_cloud_ply
+from utopic_cli.multiway import batch as room
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def stubbed(monkeypatch):
+    """No network: the stub knows the answers."""
+    run = room.run_batch
+    seen = []
+
+    def run_stubbed(asked, progress=None):
+        seen.append(asked)
+        return run(asked, progress=progress, make_task=make_stub)
+
+    monkeypatch.setattr(room, "_weights", lambda options: {"name": "stub", "sha256": "stub"})
+    monkeypatch.setattr(room, "run_batch", run_stubbed)
+    return seen
+
+
+def test_a_folder_becomes_one_group(cli, stubbed, tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply", "c[1].ply"])
+    out = tmp_path / "out"
+    options = ["--merge", "--html", "--workers", 2, "--seed", 3, "--points", 80, "--timeout", 50]
+    result = cli("batch", tmp_path / "scans", "--out-dir", out, *options)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == ""
+    assert "3 of 3 scans placed, in one group" in result.stderr
+    assert "3 scans: a, b, c[1]" in result.stderr
+    assert "3 tried: 3 used" in result.stderr
+    made = {path.name for path in out.iterdir()}
+    assert made == {
+        *(
+            "poses.json",
+            "poses.txt",
+            "poses.csv",
+            "summary.csv",
+            "merged.ply",
+            "report.html",
+            "pairs",
+            "scans",
+        )
+    }
+    (asked,) = stubbed
+    assert (asked.workers, asked.timeout_s, asked.options.seed, asked.options.points) == (2, 50.0, 3, 80)
+    assert asked.options.threads == 1
+
+
+def test_parts_and_nothing_have_exit_codes_of_their_own(cli, stubbed, tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply", "c.ply"])
+    (tmp_path / "scans" / "d.ply").write_text("no scan")
+    result = cli("batch", tmp_path / "scans", "--out-dir", tmp_path / "out")
+    assert result.exit_code == 6
+    assert "left out d: " in result.stderr and "d.ply" in result.stderr
+    write_scans(tmp_path / "two", ["a.ply", "b.ply"], objects=2)
+    result = cli("batch", tmp_path / "two", "--out-dir", tmp_path / "none", "-q")
+    assert result.exit_code == 7
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["scans", "--out-dir", "out", "--pairs", "x"], 2, "--pairs x: choose auto, all, sequential"),
+        (["scans", "--out-dir", "out", "--merge-voxel", "1"], 2, "--merge-voxel needs --merge"),
+        (["scans", "--out-dir", "scans"], 2, "choose another --out-dir"),
+        (["scans", "--out-dir", "out", "--resume", "--overwrite"], 2, "choose one"),
+        (["nowhere", "--out-dir", "out"], 4, "no such file or folder"),
+        (["scans/a.ply", "--out-dir", "out"], 4, "at least two"),
+        (["scans", "--out-dir", "out", "--pairs", "none.csv"], 4, "none.csv: no such file"),
+        (["scans", "--out-dir", "no/such/out"], 5, "the folder can't be made"),
+    ],
+)
+def test_mistakes_are_told_in_one_line_before_any_work(
+    cli, stubbed, tmp_path, monkeypatch, arguments, code, said
+):
+    monkeypatch.chdir(tmp_path)
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply"])
+    result = cli("batch", *arguments)
+    assert result.exit_code == code
+    assert said in result.stderr and len(result.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_prints_the_plan_and_writes_nothing(cli, stubbed, tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply", "c.ply"])
+    (tmp_path / "scans" / "d.ply").write_bytes((tmp_path / "scans" / "a.ply").read_bytes())
+    result = cli("batch", tmp_path / "scans", "--out-dir", tmp_path / "out", "--dry-run", "--workers", 3)
+    assert result.exit_code == 0
+    assert "copy of a" in result.stdout
+    assert [line for line in result.stdout.splitlines() if line.startswith("pair ")] == [
+        *("pair  b--a", "pair  c--a", "pair  c--b")
+    ]
+    assert "3 pairs of 3 scans, 3 at a time" in result.stdout
+    assert not (tmp_path / "out").exists() and not stubbed
+
+
+SCRIPT = """
+import os
+from functools import partial
+from tests.multiway.stubs import make_stub
+from utopic_cli.multiway import batch as room
+run = room.run_batch
+room._weights = lambda options: {"name": "stub", "sha256": "stub"}
+room.run_batch = lambda asked, progress=None: run(
+    asked, progress=progress, make_task=partial(make_stub, "", True, float(os.environ["PAUSE"]))
+)
+from utopic_cli.cli import main
+if __name__ == "__main__":
+    main()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_what_is_done_stays_when_a_batch_is_interrupted(tmp_path, how):
+    write_scans(tmp_path / "scans", [f"s{i}.ply" for i in range(4)])
+    script = tmp_path / "stubbed.py"
+    script.write_text(SCRIPT)
+    out = tmp_path / "out"
+
+    def start(folder, pause, *more):
+        command = [sys.executable, script, "batch", tmp_path / "scans", "--out-dir", folder, "--workers", 1]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PAUSE": pause}
+        return subprocess.Popen(
+            [str(part) for part in (*command, *more)],
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+
+    process = start(out, "1.0")
+    while len(list(out.glob("pairs/*.json"))) < 2 and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(how)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL), said
+    done = {path.name: path.stat().st_mtime_ns for path in out.glob("pairs/*.json")}
+    assert 2 <= len(done) < 6
+    assert not (out / "poses.json").exists()
+
+    again = start(out, "0.0", "--resume")
+    assert again.communicate(timeout=60)[1].count("were done before") == 1
+    assert again.returncode == 0
+    assert done.items() <= {path.name: path.stat().st_mtime_ns for path in out.glob("pairs/*.json")}.items()
+    whole = start(tmp_path / "whole", "0.0")
+    whole.communicate(timeout=60)
+    assert (out / "poses.json").read_bytes() == (tmp_path / "whole" / "poses.json").read_bytes()
+
+
+def test_three_real_scans_become_one_model(cli, tmp_path, monkeypatch):
+    """The whole way once, network and all: three views of the demo's dragon."""
+    from utopic_cli.synthesis.demo_object import demo_mesh
+    from utopic_cli.synthesis.scanner import range_scan
+    from utopic_cli.synthesis.surface import sample_surface
+
+    rng = np.random.default_rng(4)
+    points, normals = sample_surface(*demo_mesh(64), 60_000, rng)[:2]
+    worlds = {}
+    (tmp_path / "scans").mkdir()
+    for i, angle in enumerate((0.0, 0.35, 0.7)):
+        view = range_scan(
+            points, normals, np.array([np.cos(angle), np.sin(angle), 0.3]), rng, cell=0.03, count=4000
+        )
+        worlds[f"view{i}"] = world = random_motion(rng)
+        moved = view.transformed(invert(world)).points
+        colours = np.full(moved.shape, 90, np.uint8)
+        (tmp_path / "scans" / f"view{i}.ply").write_bytes(scalar_cloud_ply(moved, colours, {}))
+    out = tmp_path / "out"
+    result = cli("batch", tmp_path / "scans", "--out-dir", out, "--workers", 1, "--points", 400, "--merge")
+    assert result.exit_code == 0, result.output
+    poses = json.loads((out / "poses.json").read_text())
+    for entry in poses["scans"]:
+        known = invert(worlds["view0"]) @ worlds[entry["scan"]]
+        found = np.array(entry["T_world_scan"])
+        assert relative_rotation_error_deg(found, known) < 2.0
+    record = json.loads((out / "pairs" / "view1--view0.json").read_text())
+    assert record["report"]["weights"]["name"] == "utopic"

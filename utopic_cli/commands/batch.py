@@ -1,0 +1,215 @@
+"""``utopic batch``: a folder of scans in, one frame out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from utopic_cli.commands.console import (
+    RUNNING,
+    SOLVING,
+    Console,
+    Debug,
+    Device,
+    Overwrite,
+    Quiet,
+    Seed,
+    Verbose,
+    Weights,
+)
+from utopic_cli.config import AlignOptions
+from utopic_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from utopic_cli.multiway.outcome import BatchOutcome
+    from utopic_cli.multiway.plan import BatchPlan, BatchRequest
+
+_OUTPUTS = "What to write"
+_DEFAULTS = AlignOptions()
+
+MOST_FAILURES_SAID = 5
+
+
+def batch(
+    inputs: Annotated[
+        list[Path], typer.Argument(metavar="INPUT...", help="A folder of scans, a pattern, or files.")
+    ],
+    out_dir: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where everything goes.", rich_help_panel=_OUTPUTS)
+    ],
+    pairs: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|all|sequential|to-first|FILE.csv",
+            help="Which pairs to try; auto: the most promising ones, all of them up to 12 scans.",
+            rich_help_panel=SOLVING,
+        ),
+    ] = "auto",
+    merge: Annotated[
+        bool,
+        typer.Option(
+            "--merge",
+            help="Write merged.ply: all scans of the largest group, colours kept, the field 'scan' says "
+            "which; merged-2.ply and so on for further groups.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = False,
+    merge_voxel: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SIZE",
+            help="Thin merged clouds to one point a cell of this size, in the files' unit.",
+            rich_help_panel=_OUTPUTS,
+        ),
+    ] = None,
+    html: Annotated[
+        bool, typer.Option("--html", help="Write report.html.", rich_help_panel=_OUTPUTS)
+    ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on with the batch in --out-dir: only what is missing or has changed is done.",
+        ),
+    ] = False,
+    overwrite: Overwrite = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be done, write nothing.")
+    ] = False,
+    points: Annotated[
+        int,
+        typer.Option(min=50, help="Most points per scan the network sees.", rich_help_panel=SOLVING),
+    ] = _DEFAULTS.points,
+    weights: Weights = _DEFAULTS.weights,
+    workers: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="Processes; 0: one for each CPU, 4 at most. The result does not depend on it.",
+            rich_help_panel=RUNNING,
+        ),
+    ] = 0,
+    timeout: Annotated[
+        float,
+        typer.Option(
+            min=1.0,
+            metavar="S",
+            help="Seconds a pair may take before it is ended.",
+            rich_help_panel=RUNNING,
+        ),
+    ] = 600.0,
+    device: Device = "auto",
+    threads: Annotated[
+        int, typer.Option(min=1, help="CPU threads of each process.", rich_help_panel=RUNNING)
+    ] = 1,
+    seed: Seed = _DEFAULTS.seed,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Align many scans into one frame.
+
+    [bold]p_world = T_world_scan @ p_scan[/bold]
+
+    Scans that don't connect are left out and named; several groups are kept apart.
+    Writes poses.json, poses.txt, poses.csv, summary.csv and pairs/*.json.
+    Exit codes: 0 all scans in one group; 6 some are left out, or there are several groups; 7 nothing
+    aligned.
+    """
+    console = Console(quiet=quiet, verbose=verbose)
+    if merge_voxel is not None and not (merge and 0.0 < merge_voxel < float("inf")):
+        raise UsageError("--merge-voxel needs --merge and a size above 0")
+    with console.progress() as progress:
+        progress("loading libraries")
+        from utopic_cli.multiway.batch import run_batch
+        from utopic_cli.multiway.plan import BatchRequest, plan_batch
+
+        request = BatchRequest(
+            inputs=tuple(inputs),
+            out_dir=out_dir,
+            pairs=pairs,
+            options=AlignOptions(weights=weights, points=points, device=device, threads=threads, seed=seed),
+            workers=workers or min(4, _cpus()),
+            timeout_s=timeout,
+            resume=resume,
+            overwrite=overwrite,
+            merge=merge,
+            voxel=merge_voxel,
+            page=html,
+        )
+        outcome = None if dry_run else run_batch(request, progress=progress)
+        plan = plan_batch(request) if outcome is None else None
+    if plan is not None:
+        _say_plan(plan, request)
+    if outcome is not None:
+        _say_outcome(outcome, request, console)
+        if outcome.exit_code:
+            raise typer.Exit(outcome.exit_code)
+
+
+def _cpus() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _say_plan(plan: BatchPlan, request: BatchRequest) -> None:
+    """Say on stdout what would be done."""
+    scans = plan.scans.scans
+    for scan in scans:
+        fate = scan.problem or (f"copy of {scan.copy_of}" if scan.copy_of else "to align")
+        typer.echo(_printable(f"scan  {scan.name}  {scan.path}  {fate}"))
+    if plan.first is None:
+        typer.echo(
+            f"pairs  chosen by what the network sees of each of {len(plan.usable)} scans; "
+            f"at most {10 * len(plan.usable)}"
+        )
+        return
+    for source, target in plan.first:
+        typer.echo(_printable(f"pair  {scans[source].name}--{scans[target].name}"))
+    typer.echo(f"{len(plan.first)} pairs of {len(plan.usable)} scans, {request.workers} at a time")
+
+
+def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console) -> None:
+    console.warnings(tuple(_printable(note) for note in outcome.notes))
+    placed = sum(entry.group is not None for entry in outcome.scans)
+    wanted = sum(entry.passed_over is None for entry in outcome.scans)
+    groups = outcome.model.groups
+    said = "one group" if len(groups) == 1 else f"{len(groups)} groups"
+    console.line(f"{placed} of {wanted} scans placed" + (f", in {said}" if groups else ""))
+    for number, group in enumerate(groups, 1):
+        names = ", ".join(outcome.scans[scan].file.name for scan in group.T_world_scan)
+        console.line(_printable(f"  {f'group {number}':<9}{len(group.T_world_scan)} scans: {names}"))
+    for entry in outcome.scans:
+        if entry.left_out is not None:
+            console.line(_printable(f"  {'left out':<9}{entry.file.name}: {entry.left_out}"))
+        elif entry.passed_over is not None:
+            console.line(_printable(f"  {'no scan':<9}{entry.passed_over}"))
+    verdicts: dict[str, int] = {}
+    for pair in outcome.model.pairs:
+        verdicts[pair.verdict] = verdicts.get(pair.verdict, 0) + 1
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
+    again = f" ({outcome.resumed} were done before)" if outcome.resumed else ""
+    console.line(f"  {'pairs':<9}{len(outcome.model.pairs)} tried{again}: {counts}")
+    failed = 0
+    for pair in outcome.model.pairs:
+        reason = f": {pair.reason}" if pair.reason else ""
+        name = outcome.pair_name(pair.source, pair.target)
+        line = _printable(f"  {'pair':<9}{name} {pair.verdict}{reason}")
+        failed += pair.verdict == "failed"
+        if pair.verdict == "failed" and failed <= MOST_FAILURES_SAID:
+            console.line(line)
+        else:
+            console.detail(line)
+    if failed > MOST_FAILURES_SAID:
+        console.line(f"  {'':<9}{failed - MOST_FAILURES_SAID} more pairs failed: see summary.csv")
+    console.line(f"  {'time':<9}{outcome.seconds:.0f} s")
+    console.line(f"  {'wrote':<9}{request.out_dir / 'poses.json'} and what is beside it")
+
+
+def _printable(text: str) -> str:
+    """Return text that any terminal takes, whatever of a file's name it quotes."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")

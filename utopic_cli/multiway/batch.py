@@ -1,0 +1,329 @@
+"""A batch as a few verbs: find scans, describe them, try pairs, connect, write."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from utopic_cli import __version__
+from utopic_cli.config import AlignOptions
+from utopic_cli.errors import InputError, OutputError
+from utopic_cli.io.output import write_together
+from utopic_cli.multiway import pairs as choice
+from utopic_cli.multiway.edges import ScanShape
+from utopic_cli.multiway.journal import KINDS, Journal, fingerprint
+from utopic_cli.multiway.lock import locked
+from utopic_cli.multiway.merge import write_merged
+from utopic_cli.multiway.model import Model, build_model
+from utopic_cli.multiway.outcome import BatchOutcome, ScanEntry, pair_name
+from utopic_cli.multiway.page import batch_page
+from utopic_cli.multiway.plan import BatchPlan, BatchRequest, plan_batch
+from utopic_cli.multiway.scans import ScanFile
+from utopic_cli.multiway.tables import poses_csv, poses_json, poses_txt, summary_csv
+from utopic_cli.multiway.tasks import DescribeJob, RegisterJob, ScanRef, make_worker
+from utopic_cli.multiway.workers import Task, Workers
+
+Progress = Callable[[str], None]
+Record = dict[str, Any]
+
+RECORD_VERSION = 1
+CONTENT = {"scans": "description", "pairs": "report"}
+
+
+def run_batch(
+    request: BatchRequest,
+    *,
+    progress: Progress | None = None,
+    make_task: Callable[[], Task] | None = None,
+) -> BatchOutcome:
+    """Align scans into groups and write everything asked for.
+
+    Args:
+        request: see ``BatchRequest``.
+        progress: called with a word on what is at work.
+        make_task: stands in for ``tasks.make_worker``, see ``Workers``.
+
+    Returns:
+        What it came to; its ``exit_code`` says whether all scans connect.
+
+    Raises:
+        InputError: no scan can be read, or the weights can't be used.
+        OutputError: a file can't be written, an earlier batch is in the way, or another is at
+            work in ``out_dir``. What is done stays.
+        UsageError: options contradict each other.
+    """
+    return _Batch(request, progress or (lambda step: None), make_task).run()
+
+
+class _Batch:
+    """One batch at work."""
+
+    def __init__(
+        self, request: BatchRequest, progress: Progress, make_task: Callable[[], Task] | None
+    ) -> None:
+        options = replace(request.options, threads=max(1, request.options.threads))
+        self._request = request
+        self._options = options
+        self._progress = progress
+        self._make_task = make_task or partial(make_worker, options)
+        self._resumed = 0
+
+    def run(self) -> BatchOutcome:
+        """Do everything, in order."""
+        begin = time.monotonic()
+        request = self._request
+        self._progress("looking at the scans")
+        plan = plan_batch(request)
+        self._files = plan.scans.scans
+        self._weights = _weights(self._options)
+        _make_folder(request.out_dir)
+        with locked(request.out_dir):
+            _check_earlier(request)
+            self._journal = Journal(request.out_dir)
+            if request.overwrite:
+                self._journal.clear()
+            with Workers(
+                self._make_task, request.workers, request.timeout_s, self._options.threads
+            ) as workers:
+                self._workers = workers
+                described = self._describe(plan)
+                model, records = self._align(plan, described)
+            outcome = self._outcome(plan, described, model, records, time.monotonic() - begin)
+            self._write(outcome)
+        return outcome
+
+    def _describe(self, plan: BatchPlan) -> dict[int, Record]:
+        """Describe every usable scan; records by number."""
+        wanted = plan.first is None
+        jobs, names, marks = [], [], []
+        for number in plan.usable:
+            scan = self._files[number]
+            jobs.append(DescribeJob(_ref(scan), wanted))
+            names.append(scan.name)
+            marks.append(self._mark("scan", wanted, scan.sha256))
+        records = dict(zip(plan.usable, self._do("scans", names, marks, jobs), strict=True))
+        if not any(record["status"] == "done" for record in records.values()):
+            problems = [scan.problem for scan in self._files if scan.problem]
+            problems += [record["problem"] for record in records.values()]
+            raise InputError(f"none of {len(self._files)} scans can be read; the first: {problems[0]}")
+        return records
+
+    def _align(
+        self, plan: BatchPlan, described: dict[int, Record]
+    ) -> tuple[Model, dict[choice.Pair, Record]]:
+        """Try pairs, round by round, until nothing more is promising."""
+        shapes, descriptors = {}, {}
+        for number, record in described.items():
+            if record["status"] == "done":
+                content = record["description"]
+                shapes[number] = ScanShape(np.array(content["centroid"]), np.array(content["moments"]))
+                if plan.first is None:
+                    descriptors[number] = np.array(content["descriptor"])
+        records: dict[choice.Pair, Record] = {}
+        todo = list(plan.first) if plan.first is not None else choice.similar_pairs(descriptors)
+        rounds = choice.MOST_ROUNDS if plan.first is None else 1
+        model = build_model(records, shapes)
+        while todo and rounds:
+            records.update(self._register([pair for pair in todo if set(pair) <= shapes.keys()]))
+            self._progress("connecting")
+            model = build_model(records, shapes)
+            rounds -= 1
+            todo = choice.further_pairs(model, descriptors, set(records)) if rounds else []
+        return model, records
+
+    def _register(self, pairs: Sequence[choice.Pair]) -> dict[choice.Pair, Record]:
+        jobs, names, marks = [], [], []
+        for source, target in pairs:
+            both = (self._files[source], self._files[target])
+            jobs.append(RegisterJob(*map(_ref, both)))
+            names.append(pair_name(*both))
+            marks.append(self._mark("pair", both[0].sha256, both[1].sha256))
+        return dict(zip(pairs, self._do("pairs", names, marks, jobs), strict=True))
+
+    def _do(self, kind: str, names: list[str], marks: list[str], jobs: list[Any]) -> list[Record]:
+        """Do jobs that no record is there for; returns the records in the order of the jobs."""
+        found = {i: self._journal.load(kind, names[i], marks[i]) for i in range(len(jobs))}
+        records = {i: record for i, record in found.items() if record is not None}
+        if kind == "pairs":
+            self._resumed += len(records)
+        left = [i for i in range(len(jobs)) if i not in records]
+        pace = _Pace(kind, len(jobs), len(left), self._progress)
+        for place, outcome in self._workers.run([jobs[i] for i in left]):
+            i = left[place]
+            status = "done" if outcome.problem is None else "refused" if outcome.lasting else "failed"
+            record: Record = {
+                "status": status,
+                "problem": outcome.problem,
+                "seconds": round(outcome.seconds, 3),
+            }
+            if outcome.result is not None:
+                record[CONTENT[kind]] = outcome.result
+            records[i] = self._journal.commit(kind, names[i], marks[i], record)
+            pace.step(names[i])
+        return [records[i] for i in range(len(jobs))]
+
+    def _mark(self, *content: Any) -> str:
+        """Return the fingerprint of a job: all that its answer follows from."""
+        version = [RECORD_VERSION, __version__]
+        options = {name: value for name, value in asdict(self._options).items() if name != "weights"}
+        return fingerprint([version, self._weights, options, *content])
+
+    def _outcome(
+        self,
+        plan: BatchPlan,
+        described: dict[int, Record],
+        model: Model,
+        records: dict[choice.Pair, Record],
+        seconds: float,
+    ) -> BatchOutcome:
+        group_of = model.group_of()
+        numbers = {scan.name: number for number, scan in enumerate(self._files)}
+        entries = []
+        for own, scan in enumerate(self._files):
+            number = own if scan.copy_of is None else numbers[scan.copy_of]
+            record = described.get(number)
+            problem = scan.problem or (record["problem"] if record else None)
+            if problem is not None:
+                doubtful = scan.doubtful and record is not None and record["status"] == "refused"
+                reasons = (None, problem) if doubtful else (problem, None)
+                entries.append(ScanEntry(scan, None, left_out=reasons[0], passed_over=reasons[1]))
+                continue
+            assert record is not None  # what has no problem has been described
+            entry = ScanEntry(scan, int(record["description"]["points"]))
+            if number in group_of:
+                group = group_of[number]
+                place = model.groups[group].T_world_scan[number]
+                entries.append(replace(entry, group=group + 1, T_world_scan=place))
+            else:
+                entries.append(replace(entry, left_out=_why_alone(number, model)))
+        warnings = [
+            text if str(self._files[number].path) in text else f"{self._files[number].path}: {text}"
+            for number, record in described.items()
+            if record["status"] == "done"
+            for text in record["description"]["warnings"]
+        ]
+        return BatchOutcome(
+            tuple(entries),
+            model,
+            records,
+            (*plan.scans.notes, *warnings),
+            self._weights,
+            asdict(self._options),
+            self._request.pairs,
+            seconds,
+            self._resumed,
+        )
+
+    def _write(self, outcome: BatchOutcome) -> None:
+        """Write the results; ``poses.json`` is last: with it the set is whole."""
+        out = self._request.out_dir
+        merged = []
+        if self._request.merge:
+            files = dict(enumerate(self._files))
+            for number, group in enumerate(outcome.model.groups, 1):
+                merged.append(out / merged_name(number))
+                write_merged(
+                    merged[-1],
+                    group.T_world_scan,
+                    files,
+                    seed=self._options.seed,
+                    voxel=self._request.voxel,
+                    overwrite=True,
+                    progress=self._progress,
+                )
+        self._progress("writing")
+        contents = {
+            out / "summary.csv": summary_csv(outcome),
+            out / "poses.txt": poses_txt(outcome),
+            out / "poses.csv": poses_csv(outcome),
+        }
+        if self._request.page:
+            contents[out / "report.html"] = batch_page(outcome)
+        contents[out / "poses.json"] = poses_json(outcome)
+        write_together(contents, overwrite=True)
+        for path in _results(out):  # of an earlier run, and not of this one
+            if path not in contents and path not in merged:
+                path.unlink(missing_ok=True)
+
+
+class _Pace:
+    """Says how much is done and about how long the rest takes, at the pace so far."""
+
+    def __init__(self, kind: str, total: int, left: int, progress: Progress) -> None:
+        self._kind = kind
+        self._total = total
+        self._before = total - left
+        self._done = 0
+        self._begin = time.monotonic()
+        self._progress = progress
+        if left:
+            progress(f"{self._before}/{total} {kind}")
+
+    def step(self, name: str) -> None:
+        """Count one more."""
+        self._done += 1
+        each = (time.monotonic() - self._begin) / self._done
+        done = self._before + self._done
+        minutes, seconds = divmod(round(each * (self._total - done)), 60)
+        left = f"{each:.1f} s each, about {minutes}:{seconds:02d} left"
+        self._progress(f"{done}/{self._total} {self._kind}, {left}: {name}")
+
+
+def merged_name(group: int) -> str:
+    """Return the file name of a group's merged cloud; groups count from 1."""
+    return "merged.ply" if group == 1 else f"merged-{group}.ply"
+
+
+def _weights(options: AlignOptions) -> dict[str, str]:
+    """Make sure that the network can be loaded before any work, and say which it is."""
+    from utopic_cli.bridge import load_network
+
+    _, card = load_network(options.weights, options.device)
+    # The card holds the calibration of the verdict, which is not in the weights' own hash.
+    return {"name": str(card["name"]), "sha256": str(card["sha256"]), "card": fingerprint(card)}
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: the folder can't be made ({error.strerror})") from None
+
+
+def _check_earlier(request: BatchRequest) -> None:
+    """Refuse to mix with an earlier batch unless told what to do with it."""
+    if request.resume or request.overwrite:
+        return
+    out = request.out_dir
+    earlier = [path for kind in KINDS for path in (out / kind).glob("*.json")] + _results(out)
+    if earlier:
+        raise OutputError(
+            f"{out}: holds an earlier batch; pass --resume to go on with it or --overwrite to begin anew"
+        )
+
+
+def _results(out: Path) -> list[Path]:
+    """Return the results that are in a folder."""
+    names = ("poses.json", "poses.txt", "poses.csv", "summary.csv", "report.html", "merged.ply")
+    return [path for path in (*(out / name for name in names), *out.glob("merged-*.ply")) if path.is_file()]
+
+
+def _why_alone(number: int, model: Model) -> str:
+    own = [pair for pair in model.pairs if number in (pair.source, pair.target)]
+    if not own:
+        return "no pair with it was tried"
+    reasons: dict[str, int] = {}
+    for pair in own:
+        reasons[pair.verdict] = reasons.get(pair.verdict, 0) + 1
+    said = ", ".join(f"{count} {verdict}" for verdict, count in sorted(reasons.items()))
+    return f"connects with no other scan ({len(own)} pairs: {said})"
+
+
+def _ref(scan: ScanFile) -> ScanRef:
+    return ScanRef(scan.path, scan.sha256)

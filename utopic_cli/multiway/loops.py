@@ -1,0 +1,109 @@
+"""What triangles of pairs say of each pair: right ones agree, wrong ones nearly never do.
+
+Three scans registered in all three ways close a loop. If all three answers are right, going round
+it leads back; if one is wrong, it does so by accident only. Each triangle through an edge thus
+multiplies the odds that the edge is right: by
+
+    (q + (1 - q) a) / a     where the loop closes,
+    1 - q                   where it does not,
+
+q being the chance that both other edges are right, from those pairs alone, and a that of an accident:
+small, but not where a pair has rivals, for the answers of symmetric scans are wrong in few ways.
+The triangles through one edge share no other edge, so their evidence adds up without being
+counted twice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from utopic_cli.geometry.rigid import invert
+from utopic_cli.multiway.edges import Edge, ScanShape
+
+CLOSES = 0.03
+"""A loop of three closes if it moves the points of its first scan by no more than this share of its size."""
+
+ACCIDENT = 0.02
+"""Chance that a wrong answer closes a loop: scans of one object are not wrong in just any way."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is thought of one edge.
+
+    Attributes:
+        support: by how much the triangles that close raise the log odds that it is right.
+        doubt: by how much those that don't change them: a negative number, or 0.
+        agree: triangles through it that close.
+        disagree: triangles through it that don't.
+    """
+
+    support: float
+    doubt: float
+    agree: int
+    disagree: int
+
+
+def log_odds(chance: float) -> float:
+    """Return ln(p / (1 - p))."""
+    return math.log(chance / (1.0 - chance))
+
+
+def agreement(chance: float, rivals: int) -> float:
+    """Return by how much evidence that is right with this chance raises the log odds when it agrees.
+
+    Args:
+        chance: that it is right.
+        rivals: how many other answers fit nearly as well: any of them may come up.
+    """
+    accident = 1.0 / (1 + rivals) if rivals else ACCIDENT
+    return math.log((chance + (1.0 - chance) * accident) / accident)
+
+
+def disagreement(chance: float) -> float:
+    """Return by how much it changes them when it disagrees: a negative number."""
+    return math.log(1.0 - chance)
+
+
+def believe(edges: Sequence[Edge], shapes: Mapping[int, ScanShape]) -> list[Belief]:
+    """Weigh every edge by the triangles it is part of.
+
+    Args:
+        edges: at most one for any two scans.
+        shapes: of the scans, by index.
+    """
+    support, doubt = [0.0] * len(edges), [0.0] * len(edges)
+    agree, disagree = [0] * len(edges), [0] * len(edges)
+    neighbours: dict[int, dict[int, int]] = defaultdict(dict)
+    for number, edge in enumerate(edges):
+        neighbours[edge.source][edge.target] = number
+        neighbours[edge.target][edge.source] = number
+    for first in sorted(neighbours):
+        for second in sorted(n for n in neighbours[first] if n > first):
+            for third in sorted(n for n in neighbours[first] if n > second and n in neighbours[second]):
+                corners = ((first, second), (second, third), (third, first))
+                sides = [neighbours[a][b] for a, b in corners]
+                motion = np.eye(4)
+                for (start, _), side in zip(corners, sides, strict=True):
+                    motion = _along(edges[side], start) @ motion
+                rivals = max(edges[side].rivals for side in sides)
+                closes = shapes[first].displacement(motion) <= CLOSES
+                for place, side in enumerate(sides):
+                    others = math.prod(edges[other].prior for i, other in enumerate(sides) if i != place)
+                    if closes:
+                        support[side] += agreement(others, rivals)
+                        agree[side] += 1
+                    else:
+                        doubt[side] += disagreement(others)
+                        disagree[side] += 1
+    return [Belief(*row) for row in zip(support, doubt, agree, disagree, strict=True)]
+
+
+def _along(edge: Edge, start: int) -> np.ndarray:
+    """Return the transformation from scan ``start`` to the edge's other scan."""
+    return edge.T_target_source if edge.source == start else invert(edge.T_target_source)

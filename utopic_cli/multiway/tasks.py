@@ -1,0 +1,133 @@
+"""What a worker process does: describe one scan, or register two; plain data in and out."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from utopic_cli.config import AlignOptions
+from utopic_cli.errors import InputError
+from utopic_cli.io.scan import Scan, read_scan
+
+MOST_POINTS_HELD = 6_000_000
+"""A worker remembers scans up to this many points together, two at least."""
+
+DESCRIPTOR_DECIMALS = 4
+
+
+@dataclass(frozen=True)
+class ScanRef:
+    """A file to read, and the bytes it must still have."""
+
+    path: Path
+    sha256: str
+
+
+@dataclass(frozen=True)
+class DescribeJob:
+    """Describe a scan; ``descriptor``: what the network sees of it, too."""
+
+    scan: ScanRef
+    descriptor: bool
+
+
+@dataclass(frozen=True)
+class RegisterJob:
+    """Register a pair."""
+
+    source: ScanRef
+    target: ScanRef
+
+
+Job = DescribeJob | RegisterJob
+
+
+def make_worker(options: AlignOptions) -> Callable[[Job], dict[str, Any]]:
+    """Return the task of one process: a job in, its record out.
+
+    The task raises ``InputError`` for what can't be read or registered.
+    """
+    from utopic_cli.bridge import load_network
+
+    reader = _Reader(options.seed)
+    load_network(options.weights, options.device)  # before there is a job whose time it could take
+
+    def work(job: Job) -> dict[str, Any]:
+        if isinstance(job, DescribeJob):
+            return describe(reader(job.scan), options, job.descriptor)
+        return register(reader(job.source), reader(job.target), options)
+
+    return work
+
+
+def describe(scan: Scan, options: AlignOptions, descriptor: bool) -> dict[str, Any]:
+    """Return a scan's size and shape as JSON-ready data.
+
+    Keys: ``points``; ``centroid`` (3) and ``moments`` (3, 3), the covariance of the points, file
+    units; ``warnings``; ``descriptor`` if asked for, see ``pooled_descriptor``.
+    """
+    points = scan.cloud.points
+    centroid = points.mean(axis=0)
+    centred = points - centroid
+    record = {
+        "points": len(points),
+        "centroid": centroid.tolist(),
+        "moments": (centred.T @ centred / len(points)).tolist(),
+        "warnings": list(scan.warnings),
+    }
+    if descriptor:
+        pooled = pooled_descriptor(scan, options)
+        record["descriptor"] = np.round(pooled, DESCRIPTOR_DECIMALS).tolist()
+    return record
+
+
+def pooled_descriptor(scan: Scan, options: AlignOptions) -> np.ndarray:
+    """Return the mean and spread of a scan's point descriptors, before any pair is known -> (2 D,).
+
+    The network's descriptors don't depend on the pose, so neither does this.
+    """
+    import torch
+
+    from utopic_cli.bridge import cpu_threads, load_network, to_cloud_input
+    from utopic_cli.preprocess import prepare
+
+    model, _ = load_network(options.weights, options.device)
+    with cpu_threads(options.threads), torch.inference_mode():
+        prepared = prepare(scan.cloud, scan.cloud, options.points)
+        cloud = to_cloud_input(prepared.source, prepared.spacing, model.config.neighbours)
+        _, descriptors = model.extractor(cloud.to(next(model.parameters()).device))
+    each = descriptors[0].cpu().numpy().astype(np.float64)  # (N, D)
+    return np.concatenate([each.mean(axis=0), each.std(axis=0)])
+
+
+def register(source: Scan, target: Scan, options: AlignOptions) -> dict[str, Any]:
+    """Return the report of one registration, as ``utopic align`` writes it."""
+    from utopic_cli import pipeline
+    from utopic_cli.report import build_report
+
+    result = pipeline.register(source.cloud, target.cloud, options)
+    return build_report(source, target, result)
+
+
+class _Reader:
+    """Reads scans, and remembers the last few."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._held: OrderedDict[Path, Scan] = OrderedDict()
+
+    def __call__(self, wanted: ScanRef) -> Scan:
+        scan = self._held.pop(wanted.path, None)
+        if scan is None:
+            scan = read_scan(wanted.path, seed=self._seed)
+            if scan.sha256 != wanted.sha256:
+                raise InputError(f"{wanted.path}: has changed since the batch began; run it again")
+        self._held[wanted.path] = scan
+        while len(self._held) > 2 and sum(held.records for held in self._held.values()) > MOST_POINTS_HELD:
+            self._held.popitem(last=False)
+        return scan
