@@ -12,7 +12,7 @@ from utopic_cli.estimation.confidence import Calibration
 from utopic_cli.estimation.evidence import SAME
 from utopic_cli.geometry import rigid
 from utopic_cli.result import FreeMotion, Observability
-from utopic_cli.verdict import UNCALIBRATED, judge, motion_in_words, read_calibration
+from utopic_cli.verdict import UNCALIBRATED, UNUSUAL, Verdict, judge, motion_in_words, read_calibration
 
 GOOD = {"likeness": 1.0, "conflict": -2.5, "spread": SAME, "support": -0.6, "lead": 0.5, "fixed": -1.0}
 FIXED = Observability(np.full(6, 0.3), (), np.eye(6), np.zeros(3), 500)
@@ -25,7 +25,7 @@ def calibration(lead: float = 10.0) -> Calibration:
 
 
 def verdict(signals: dict[str, float] | None = None, rivals: Any = (), seen: Any = FIXED, share: float = 0.6):  # type: ignore[no-untyped-def]
-    ratio = {"source": 0.7, "target": share}
+    ratio = {"source": share, "target": share / 2}
     return judge(calibration(), {**GOOD, **(signals or {})}, np.eye(4), rivals, seen, ratio)
 
 
@@ -64,7 +64,7 @@ def test_each_bad_sign_is_named(signals: dict[str, float], said: str) -> None:
 
 
 def test_little_overlap_is_named_with_its_scan() -> None:
-    assert "only 4% of the target finds a counterpart" in verdict({"lead": 0.0}, share=0.04).reasons[0]
+    assert "only 4% of the source finds a counterpart" in verdict({"lead": 0.0}, share=0.04).reasons[0]
 
 
 def test_free_motions_are_named_by_kind_and_axis() -> None:
@@ -91,21 +91,41 @@ def test_rivals_are_counted_and_their_angle_told() -> None:
         for angle in (90.0, 180.0)
     )
     assert "two poses fit about equally well, 90° apart" in verdict({"lead": 0.0}, [quarter]).reasons[0]
-    assert "3 poses fit about equally well, 180° apart" in verdict({"lead": 0.0}, [quarter, half]).reasons[0]
+    assert (
+        "3 poses fit about equally well, up to 180° apart"
+        in verdict({"lead": 0.0}, [quarter, half]).reasons[0]
+    )
 
 
-def test_sizes_that_differ_like_units_come_first() -> None:
+def test_a_rival_that_is_only_shifted_is_named_so() -> None:
+    along = rigid.rigid(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    (reason,) = verdict({"lead": 0.0}, [along]).reasons
+    assert reason.startswith("two poses fit about equally well, shifted against each other")
+
+
+def test_sizes_that_differ_come_first() -> None:
     ratio = {"source": 0.7, "target": 0.02}
-    found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, size_ratio=987.0)
-    assert found.reasons[0] == "the scans' sizes differ by a factor of about 987: millimetres against metres?"
     found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, size_ratio=12.0)
-    assert found.reasons[0].endswith("about 12: are both in the same unit?")
+    assert found.reasons[0] == "the scans' sizes differ by a factor of about 12: are both in the same unit?"
+
+
+def test_an_answer_found_another_way_than_the_calibrations_has_no_verdict() -> None:
+    ratio = {"source": 0.7, "target": 0.7}
+    found = judge(calibration(), GOOD, np.eye(4), (), FIXED, ratio, usual=False)
+    assert found == Verdict(None, False, (UNUSUAL,))
+
+
+def test_no_rotation_of_a_sphere_is_determined() -> None:
+    axes = tuple(FreeMotion("rotation", axis, np.zeros(3)) for axis in np.eye(3))
+    seen = Observability(np.zeros(6), axes, np.eye(6), np.zeros(3), 500)
+    (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
+    assert reason == "symmetric: no rotation is determined, as of a sphere"
 
 
 def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
     found = verdict({"conflict": -1.3})
     assert found.trusted and len(found.reasons) == 2
-    assert found.reasons[1] == "against it: parts of one scan stand where the other saw empty space"
+    assert found.reasons[1] == "but parts of one scan stand where the other saw empty space"
     (praise, doubt) = verdict({"likeness": 0.5}).reasons
     assert praise == "taken together, the signs speak for it" and "agree only 50% as well" in doubt
 
@@ -133,3 +153,6 @@ def test_a_card_without_a_calibration_has_none_and_a_damaged_one_is_an_error() -
         read_calibration({"name": "mine", "calibration": {"signals": ["a"]}})
     with pytest.raises(InputError, match="mine: the calibration"):
         read_calibration({"name": "mine", "calibration": "yes"})
+    other = {**calibration().as_dict(), "signals": ["scor"]}
+    with pytest.raises(InputError, match="rests on scor, which this version doesn't measure"):
+        read_calibration({"name": "mine", "calibration": other})

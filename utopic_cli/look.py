@@ -24,7 +24,7 @@ CLEAR_OUTWARDNESS = 0.1
 UNCLEAR_MARGIN = (0.02, 0.3)
 """Answers whose standing exceeds their best rival's by so much deserve a second sampling."""
 
-LEAST_SUPPORT = 0.04
+HOPELESS_SUPPORT = 0.04
 """Answers that explain a smaller share of what the network matched are hardly ever right."""
 
 
@@ -56,7 +56,7 @@ class Look:
         (two poses that fit alike) or explains next to nothing of what was matched.
         """
         least, most = UNCLEAR_MARGIN
-        unclear = least < self.estimate.margin < most and self.estimate.support > LEAST_SUPPORT
+        unclear = least < self.estimate.margin < most and self.estimate.support > HOPELESS_SUPPORT
         return unclear and not self.estimate.shared_points
 
     @property
@@ -126,5 +126,8 @@ def look_both_sides(
     if solver == "svd" or not first.sides_in_doubt:
         return first
     turned = replace(prepared, source=prepared.source.turned_inside_out())
-    other = look(see, turned, solver, initial)
+    try:
+        other = look(see, turned, solver, initial)
+    except InputError:  # the side first taken stands
+        return first
     return replace(other, inside_out=True) if other.estimate.outranks(first.estimate) else first

@@ -14,6 +14,7 @@ from utopic_cli.config import SOLVERS, AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.evidence import SAME, Seen, collect_evidence
 from utopic_cli.estimation.observability import observe
+from utopic_cli.estimation.problem import working_voxel
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
 from utopic_cli.estimation.verification import measure_fit
@@ -22,9 +23,9 @@ from utopic_cli.io.records import FormatError
 from utopic_cli.io.scan import check_points, read_scan
 from utopic_cli.look import look, look_both_sides
 from utopic_cli.point_cloud import PointCloud
-from utopic_cli.preprocess import DENSE_RATIO, PreparedPair, carry_to_all, prepare
+from utopic_cli.preprocess import PreparedPair, carry_to_all, prepare, size_ratio
 from utopic_cli.result import Correspondences, Observability, RegistrationResult
-from utopic_cli.verdict import UNIT_MISMATCH, judge, read_calibration, size_in_words
+from utopic_cli.verdict import judge, read_calibration
 
 FEWEST_NODES = 50
 """The network sees at least this many points of a scan that has them."""
@@ -104,8 +105,7 @@ def _register(
     """The verbs of a registration, in order."""
     clock.start("load weights")
     model, card = load_network(options.weights, options.device)
-    # What the calibration rests on, rivals above all, only the solver "auto" looks for.
-    calibration = read_calibration(card) if options.solver == "auto" else None
+    calibration = read_calibration(card)
     clock.start("prepare")
     prepared = prepare(source, target, options.points, clean=True)
     clock.start("predict and solve")
@@ -121,9 +121,13 @@ def _register(
         again = prepare(source, target, options.points, clean=True, resampled=rng)
         if answer.inside_out:
             again = replace(again, source=again.source.turned_inside_out())
-        other = look(see, again, options.solver, initial)
-        spread = answer.spread(other)
-        answer = answer.joined(other)
+        try:
+            other = look(see, again, options.solver, initial)
+        except InputError:  # nothing follows from this sampling: as far from agreeing as can be
+            spread = 0.0
+        else:
+            spread = answer.spread(other)
+            answer = answer.joined(other)
     prepared, view, estimate = answer.prepared, answer.view, answer.estimate
     transformation = prepared.denormalise(estimate.T_target_source)
     if options.refine:
@@ -136,7 +140,7 @@ def _register(
     clock.start("measure")
     threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
     fit = measure_fit(source, target, transformation, threshold, estimate.support)
-    voxel = prepared.spacing / DENSE_RATIO
+    voxel = working_voxel(prepared.source.dense, prepared.target.dense, prepared.spacing)
     surfaces = make_surface(prepared.source.dense, voxel), make_surface(prepared.target.dense, voxel)
     observability = _observe(prepared, *surfaces, normalised)
     signals = collect_evidence(
@@ -160,9 +164,17 @@ def _register(
         view.target_overlap,
         view.target_uncertainty,
     )
-    size_ratio = _size_ratio(source, target)
+    sizes = size_ratio(source.points, target.points)
     verdict = judge(
-        calibration, signals, transformation, rivals, observability, fit.overlap_ratio, size_ratio
+        calibration,
+        signals,
+        transformation,
+        rivals,
+        observability,
+        fit.overlap_ratio,
+        sizes,
+        # Only "auto" looks for all the rivals, and unrefined surfaces agree less.
+        usual=options.solver == "auto" and options.refine,
     )
     return RegistrationResult(
         T_target_source=transformation,
@@ -180,7 +192,7 @@ def _register(
         observability=observability,
         timings_s=clock.stop(),
         signals=signals,
-        warnings=(size_in_words(size_ratio),) if size_ratio >= UNIT_MISMATCH else (),
+        warnings=(),
         weights_name=str(card["name"]),
         weights_sha256=str(card["sha256"]),
         # With what "auto" and 0 came to: device and thread count can change the last bits.
@@ -269,9 +281,3 @@ def _summary(view: NetworkView) -> dict[str, float]:
         "p50": float(np.percentile(both, 50)),
         "p90": float(np.percentile(both, 90)),
     }
-
-
-def _size_ratio(source: PointCloud, target: PointCloud) -> float:
-    """Extent of the larger scan over that of the smaller one."""
-    extents = [float(np.linalg.norm(np.ptp(cloud.points, axis=0))) for cloud in (source, target)]
-    return max(extents) / min(extents)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from utopic_cli.errors import InputError
 from utopic_cli.geometry.normals import estimate_normals, orient_normals, orient_towards
-from utopic_cli.geometry.outliers import scattered
+from utopic_cli.geometry.outliers import astray, scattered
 from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.geometry.voxel import cell_means, voxel_downsample, voxel_index
 from utopic_cli.point_cloud import PointCloud
@@ -93,8 +93,8 @@ class PreparedPair:
     Attributes:
         source: sampled source; ``normalised = (p - source_centre) / scale``.
         target: sampled target; ``normalised = (p - target_centre) / scale``.
-        source_centre: (3,) file units.
-        target_centre: (3,) file units.
+        source_centre: (3,) file units; mean of the points that are not astray.
+        target_centre: (3,) file units, likewise.
         scale: file units per normalised unit.
         spacing: node spacing h in normalised units.
     """
@@ -153,10 +153,12 @@ def prepare(
         InputError: one scan is so much smaller than the other that nothing of it is left at a
             spacing that suits both.
     """
-    centres = [cloud.points.mean(axis=0) for cloud in (source, target)]
+    kept = [~astray(cloud.points) for cloud in (source, target)]
+    centres = [cloud.points[keep].mean(axis=0) for cloud, keep in zip((source, target), kept, strict=True)]
     centred = [cloud.points - centre for cloud, centre in zip((source, target), centres, strict=True)]
-    scale = max(float(np.quantile(np.linalg.norm(part, axis=1), 0.99)) for part in centred)
-    thinned = [_thin(part / scale) for part in centred]
+    parts = [part[keep] for part, keep in zip(centred, kept, strict=True)]
+    scale = max(float(np.quantile(np.linalg.norm(part, axis=1), 0.99)) for part in parts)
+    thinned = [_thin(part / scale) for part in parts]
     if clean:
         thinned = [_without_scattered(part) for part in thinned]
     spacing = _common_spacing(thinned, points)
@@ -292,12 +294,25 @@ def _check_sizes(clouds: list[np.ndarray], spacing: float) -> None:
     """Refuse a pair whose smaller scan is but a dot beside the larger one."""
     if min(voxel_index(points, spacing / DENSE_RATIO)[1] for points in clouds) >= FEWEST_DENSE_POINTS:
         return
-    extents = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in clouds]
-    ratio = max(extents) / max(min(extents), 1e-300)
+    ratio = size_ratio(*clouds)
     raise InputError(
-        f"the scans' sizes differ by a factor of about {ratio:.3g}: bring both to the same unit "
-        "(millimetres against metres?)"
+        f"the scans' sizes differ by a factor of about {ratio:.3g}: "
+        f"bring both to the same unit{units_in_words(ratio)}"
     )
+
+
+def size_ratio(source: np.ndarray, target: np.ndarray) -> float:
+    """Return the extent of the larger cloud over that of the smaller one, points astray left out."""
+    extents = [float(np.linalg.norm(np.ptp(points[~astray(points)], axis=0))) for points in (source, target)]
+    return max(extents) / max(min(extents), 1e-300)
+
+
+def units_in_words(ratio: float) -> str:
+    """Guess which units were mixed up, in parentheses; empty if the ratio is that of none."""
+    for factor, units in ((1000.0, "millimetres against metres"), (25.4, "millimetres against inches")):
+        if factor / 2.0 < ratio < factor * 2.0:
+            return f" ({units}?)"
+    return ""
 
 
 def _voxel_size_for(points: np.ndarray, most: int) -> float:
@@ -316,6 +331,7 @@ def _voxel_size_for(points: np.ndarray, most: int) -> float:
 
 def _own_spacing(points: np.ndarray) -> float:
     """Return the voxel size that would give a cloud's own density: 0.75 of the 8th neighbour's distance."""
+    points = np.unique(points, axis=0)  # merged files hold places many times
     k = min(9, len(points))
     return float(0.75 * np.median(cKDTree(points).query(points, k=k)[0][:, -1]))
 

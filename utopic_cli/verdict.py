@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from utopic_cli.errors import InputError
+from utopic_cli.estimation.candidates import LEAST_SUPPORT
 from utopic_cli.estimation.confidence import Calibration
+from utopic_cli.estimation.evidence import Evidence
 from utopic_cli.estimation.observability import FREE
 from utopic_cli.geometry.rigid import relative_rotation_error_deg
 from utopic_cli.result import FreeMotion, Observability
 
 UNCALIBRATED = "these weights carry no calibration, so nothing says how far to trust them: look at the result"
+UNUSUAL = "confidence is calibrated for the default solver with refinement only: look at the result"
 
 UNIT_MISMATCH = 8.0
 """Extents that differ by more than this factor are named as a likely mix-up of units."""
 
 LITTLE_OVERLAP = 0.1
-"""Below this share of points with a counterpart, even a right answer can't be told from chance."""
+"""Scans of which less than this share of either finds a counterpart hardly overlap."""
 
 DIFFERENT_SURFACES = 0.6
 """Likeness below this: where the scans meet, their surfaces differ."""
@@ -34,6 +37,9 @@ as much, and nothing else tells a body from its mirror image where most of it is
 
 FEW_EXPLAINED = -1.2
 """A log10 of the share of matches explained below this is what wrong answers reach."""
+
+SHIFTED = 5.0
+"""Rivals turned by fewer degrees against the answer differ from it by a shift."""
 
 APART = -1.5
 """Two answers farther apart than this (log10 of the share of the size) are different answers."""
@@ -64,10 +70,18 @@ def read_calibration(card: dict[str, Any]) -> Calibration | None:
     section = card.get("calibration")
     if section is None:
         return None
+    name = card.get("name", "weights")
     try:
-        return Calibration.from_dict(section)
+        calibration = Calibration.from_dict(section)
     except ValueError as error:
-        raise InputError(f"{card.get('name', 'weights')}: {error}") from error
+        raise InputError(f"{name}: {error}; fit another with utopic calibrate") from error
+    unknown = sorted(set(calibration.signals) - {field.name for field in fields(Evidence)})
+    if unknown:
+        raise InputError(
+            f"{name}: the calibration rests on {', '.join(unknown)}, which this version doesn't measure; "
+            "fit another with utopic calibrate"
+        )
+    return calibration
 
 
 def ruled_out(signals: dict[str, float]) -> bool:
@@ -87,6 +101,7 @@ def judge(
     observability: Observability | None,
     overlap_ratio: dict[str, float],
     size_ratio: float = 1.0,
+    usual: bool = True,
 ) -> Verdict:
     """Weigh the signals.
 
@@ -98,17 +113,16 @@ def judge(
         observability: which motions the overlap fixes.
         overlap_ratio: share of points with a counterpart, keys ``source`` and ``target``.
         size_ratio: extent of the larger scan over that of the smaller one.
+        usual: whether the answer came about as those did that the calibration was fitted on.
     """
     doubts = _doubts(signals, transformation, rivals, observability, overlap_ratio)
     if size_ratio >= UNIT_MISMATCH:
         doubts.insert(0, size_in_words(size_ratio))
-    if calibration is None:
-        return Verdict(None, False, (UNCALIBRATED, *doubts))
+    if calibration is None or not usual:
+        return Verdict(None, False, (UNCALIBRATED if calibration is None else UNUSUAL, *doubts))
     confidence = calibration.probability(signals)
     if confidence >= calibration.threshold and not ruled_out(signals):
-        return Verdict(
-            confidence, True, (_praise(signals, rivals), *(f"against it: {one}" for one in doubts))
-        )
+        return Verdict(confidence, True, (_praise(signals, rivals), *(f"but {one}" for one in doubts)))
     if not doubts:
         doubts = [
             f"no single sign is bad, but together they fall short of the {calibration.threshold:.0%} "
@@ -122,7 +136,7 @@ def _praise(signals: dict[str, float], rivals: Sequence[np.ndarray]) -> str:
     if likeness < DIFFERENT_SURFACES:
         return "taken together, the signs speak for it"
     share = "as well as" if likeness >= 1.0 else f"{likeness:.0%} as well as"
-    alone = "" if rivals else ", and no other transformation comes near"
+    alone = "" if rivals or signals["spread"] > APART else ", and no other transformation comes near"
     return f"where the scans meet, their surfaces agree {share} one scan does with itself{alone}"
 
 
@@ -135,18 +149,25 @@ def _doubts(
 ) -> list[str]:
     """Say what speaks against the answer, most telling first."""
     doubts = []
-    name, share = min(overlap_ratio.items(), key=lambda item: item[1])
+    name, share = max(
+        overlap_ratio.items(), key=lambda item: item[1]
+    )  # a part in a whole covers little of it
     if share < LITTLE_OVERLAP:
         doubts.append(f"only {share:.0%} of the {name} finds a counterpart")
     if observability is None:
         doubts.append("too few points lie on each other to tell which motions are determined")
+    elif sum(motion.kind == "rotation" for motion in observability.free) == 3:
+        doubts.append("symmetric: no rotation is determined, as of a sphere")
     elif observability.free:
         said = " and ".join(motion_in_words(motion) for motion in observability.free)
         doubts.append(f"symmetric: {said} {'is' if len(observability.free) == 1 else 'are'} not determined")
     if rivals:
         count = "two poses fit" if len(rivals) == 1 else f"{len(rivals) + 1} poses fit"
-        angles = [relative_rotation_error_deg(rival, transformation) for rival in rivals]
-        doubts.append(f"{count} about equally well, {max(angles):.0f}° apart: see ambiguous_with")
+        angle = max(relative_rotation_error_deg(rival, transformation) for rival in rivals)
+        apart = "shifted against each other" if angle < SHIFTED else f"up to {angle:.0f}° apart"
+        if len(rivals) == 1:
+            apart = apart.removeprefix("up to ")
+        doubts.append(f"{count} about equally well, {apart}: see ambiguous_with")
     if signals["likeness"] < DIFFERENT_SURFACES:
         doubts.append(
             f"where the scans meet, their surfaces agree only {signals['likeness']:.0%} as well as one scan "
@@ -158,14 +179,14 @@ def _doubts(
         doubts.append("another sampling of the same scans gave another answer")
     if signals["support"] < FEW_EXPLAINED:
         share = 10.0 ** signals["support"]
-        doubts.append(f"the answer explains only {share:.1%} of what the network matched")
+        few = f"only {share:.1%}" if share > LEAST_SUPPORT else f"less than {LEAST_SUPPORT:.1%}"
+        doubts.append(f"the answer explains {few} of what the network matched")
     return doubts
 
 
 def size_in_words(ratio: float) -> str:
     """Say that two scans' sizes differ by a factor, and what that may mean."""
-    units = ": millimetres against metres?" if 300 < ratio < 3000 else ": are both in the same unit?"
-    return f"the scans' sizes differ by a factor of about {ratio:.0f}{units}"
+    return f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?"
 
 
 def motion_in_words(motion: FreeMotion) -> str:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from utopic_cli.geometry.outliers import scattered
+from utopic_cli.geometry.outliers import astray, scattered
 
 
 def ball(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -39,3 +39,17 @@ def test_lines_of_a_scanner_are_no_scatter() -> None:
 
 def test_of_a_handful_of_points_nothing_is_told() -> None:
     assert not scattered(np.random.default_rng(2).uniform(-1, 1, (30, 3))).any()
+
+
+def test_a_return_at_the_origin_is_astray_and_the_far_end_of_a_scan_is_not() -> None:
+    rng = np.random.default_rng(3)
+    radius, angle = 10.0 ** rng.uniform(0.0, 2.0, 4000), rng.uniform(0.0, 2.0 * np.pi, 4000)
+    floor = np.stack([radius * np.cos(angle), radius * np.sin(angle), rng.normal(0, 0.01, 4000)], axis=1)
+    assert not astray(floor).any()
+    site = np.concatenate([floor + [4e5, 5e6, 100.0], np.zeros((3, 3))])
+    assert astray(site).tolist() == [False] * 4000 + [True] * 3
+
+
+def test_places_held_many_times_are_no_scatter() -> None:
+    places = np.random.default_rng(4).standard_normal((80, 3))
+    assert not scattered(np.repeat(places, 20, axis=0)).any()

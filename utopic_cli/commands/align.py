@@ -254,11 +254,15 @@ def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> N
     console.warnings(tuple(report["warnings"]))
     console.line(f"{outcome.source.path} -> {outcome.target.path}: {_verdict(outcome.result)}")
     for reason in outcome.result.reasons:
-        console.line(f"  {'because':<9}{reason}")
+        because, said = (
+            ("but", reason.removeprefix("but ")) if reason.startswith("but ") else ("because", reason)
+        )
+        console.line(f"  {because:<9}{said}")
     fit = outcome.result.fit
     source, target = fit.overlap_ratio["source"], fit.overlap_ratio["target"]
     console.line(f"  {'overlap':<9}{source:.0%} of the source, {target:.0%} of the target")
-    console.line(f"  {'residual':<9}{fit.inlier_rmse:.4g} file units rms where they overlap")
+    if math.isfinite(fit.inlier_rmse):
+        console.line(f"  {'residual':<9}{fit.inlier_rmse:.4g} file units rms where they overlap")
     motion = report["about_source_centroid"]
     shift = math.hypot(*motion["translation"])
     angle = f"{motion['angle_deg']:.3f} degrees about the source's centroid"

@@ -91,7 +91,8 @@ class Calibration:
         for name, column in columns.items():
             if column.shape != (len(signals),) or not np.isfinite(column).all():
                 raise ValueError(f"the calibration's {name} are not {len(signals)} numbers")
-        if not (np.isfinite(list(numbers.values())).all() and (columns["deviation"] > 0).all()):
+        sound = (columns["deviation"] > 0).all() and (columns["low"] <= columns["high"]).all()
+        if not (signals and sound and np.isfinite(list(numbers.values())).all()):
             raise ValueError("the calibration's numbers make no model")
         return cls(
             signals=signals,

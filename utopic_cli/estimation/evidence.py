@@ -153,13 +153,22 @@ def collect_evidence(
         seen_overlap=inside,
         seen_contrast=inside - outside,
         uncertainty=float(seen.uncertainty[met].mean() if met.any() else seen.uncertainty.mean()),
-        residual=high / median if median > 0 else MOST_RESIDUAL,  # NaN too: nothing has a counterpart
+        residual=_spread_of_residuals(median, high),
         spread=spread,
         shared=float(estimate.shared_points),
     )
 
 
 MOST_RESIDUAL = 10.0
+
+
+def _spread_of_residuals(median: float, high: float) -> float:
+    """The 90th percentile over the median; NaN where nothing has a counterpart."""
+    if high == 0.0:  # a perfect fit
+        return 1.0
+    return min(high / median, MOST_RESIDUAL) if median * MOST_RESIDUAL > high else MOST_RESIDUAL
+
+
 MOST_MARGIN = 0.3
 NO_CONFLICT = 0.003
 NO_LEAD = 0.02

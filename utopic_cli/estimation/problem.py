@@ -45,14 +45,18 @@ class Problem:
     spacing: float
 
 
-def working_voxel(problem: Problem) -> float:
+def working_voxel(source: PointCloud, target: PointCloud, spacing: float) -> float:
     """The length v that tolerances are multiples of.
 
     It is h / 2.2, or the dense points' own spacing where a sparse scan has fewer points than
     that: a neighbour nearer than the spacing cannot be asked for.
+
+    Args:
+        source: dense points.
+        target: dense points.
+        spacing: h, of the nodes.
     """
-    dense = max(point_spacing(problem.source_dense.points), point_spacing(problem.target_dense.points))
-    return max(problem.spacing / VOXELS_PER_SPACING, dense)
+    return max(spacing / VOXELS_PER_SPACING, point_spacing(source.points), point_spacing(target.points))
 
 
 def check_problem(problem: Problem, initial: np.ndarray | None) -> None:

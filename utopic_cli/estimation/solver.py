@@ -109,7 +109,7 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
     if solver not in ("auto", "svd", "consensus"):
         raise ValueError(f"unknown solver {solver!r}; expected auto, svd or consensus")
     check_problem(problem, initial)
-    voxel = working_voxel(problem)
+    voxel = working_voxel(problem.source_dense, problem.target_dense, problem.spacing)
     source, target = make_surface(problem.source_dense, voxel), make_surface(problem.target_dense, voxel)
     candidates = _weighted_candidates(problem)
     hypotheses: list[Hypothesis] = []

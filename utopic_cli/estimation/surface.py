@@ -10,6 +10,9 @@ from scipy.spatial import cKDTree
 
 from utopic_cli.point_cloud import PointCloud
 
+MOST_PIXELS = 2000
+"""Most pixels of a depth map along a side."""
+
 
 class DepthMap:
     """What a scan saw, as an orthographic image: the nearest surface along each line of sight.
@@ -28,8 +31,9 @@ class DepthMap:
         across = np.cross(towards, helper)
         across /= np.linalg.norm(across)
         self.axes = np.stack([across, np.cross(towards, across), towards])  # rows: x, y, towards the scanner
-        self.pitch = pitch
         seen = points @ self.axes.T
+        # However few points are spread however far, the image stays small.
+        self.pitch = pitch = max(pitch, float(np.ptp(seen[:, :2], axis=0).max()) / MOST_PIXELS)
         self.corner = seen[:, :2].min(axis=0) - 2.0 * pitch
         column, row = np.floor((seen[:, :2] - self.corner) / pitch).astype(np.int64).T
         front = np.full((column.max() + 3, row.max() + 3), -np.inf)

@@ -111,7 +111,7 @@ def _smallest_eigenvector(matrices: np.ndarray) -> np.ndarray:
     scale = np.trace(matrices, axis1=1, axis2=2) / 3.0
     scaled = matrices / np.maximum(scale, 1e-300)[:, None, None]
     shifted = scaled - np.eye(3)  # trace zero, since the mean eigenvalue is now 1
-    half = np.sqrt(np.maximum(np.einsum("nij,nij->n", shifted, shifted) / 6.0, 1e-300))
+    half = np.sqrt(np.maximum(np.einsum("nij,nij->n", shifted, shifted) / 6.0, 1e-60))
     cosine = np.clip(np.linalg.det(shifted) / (2.0 * half**3), -1.0, 1.0)
     smallest = 1.0 + 2.0 * half * np.cos((np.arccos(cosine) + 2.0 * np.pi) / 3.0)
     rows = scaled - smallest[:, None, None] * np.eye(3)

@@ -17,6 +17,23 @@ OFF = 0.7
 """A point stands off its neighbours' plane by at least this share of their root mean square spread."""
 
 
+ASTRAY = 10.0
+"""Points beyond so many times the radius that holds most of a scan are no part of it."""
+
+
+def astray(points: np.ndarray) -> np.ndarray:
+    """Tell which points lie so far off that they would decide the scan's size, like a return at (0, 0, 0).
+
+    Args:
+        points: (N, 3) in any unit, not empty.
+
+    Returns:
+        (N,) bool.
+    """
+    radius = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return radius > ASTRAY * np.quantile(radius, 0.95)
+
+
 def scattered(points: np.ndarray) -> np.ndarray:
     """Tell which points lie on no surface.
 
@@ -31,6 +48,8 @@ def scattered(points: np.ndarray) -> np.ndarray:
     tree = cKDTree(points)
     distance, index = tree.query(points, k=NEIGHBOURS + 1, workers=-1)
     mean = distance[:, 1:].mean(axis=1)
+    if not np.median(mean) > 0:  # most places are there many times: distances say nothing
+        return np.zeros(len(points), dtype=bool)
     far = np.flatnonzero(mean >= FAR * np.median(mean))
     around = points[index[far, 1:]]  # (F, k, 3)
     centre = around.mean(axis=1)
