@@ -62,7 +62,7 @@ def test_what_is_ruled_out_anyway_does_not_raise_the_threshold() -> None:
 def test_the_clearer_the_signals_the_more_is_accepted() -> None:
     shares = [
         fit(outcomes(1000, 3, steepness), {}).description["out_of_fold"]["right_accepted"]
-        for steepness in (4.0, 40.0)
+        for steepness in (4.0, 100.0)
     ]
     assert shares[0] < shares[1] and shares[1] > 0.8
 

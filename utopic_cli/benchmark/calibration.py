@@ -29,6 +29,9 @@ from utopic_cli.verdict import ruled_out
 MOST_RISK = 0.01
 """Of the answers that are trusted, at most this share is to be wrong, measured out of fold."""
 
+LEAST_CONFIDENCE = 0.9
+"""Nor is a single answer trusted that is more likely wrong than once in ten times."""
+
 FOLDS = 10
 RIDGE = 3.0
 FEWEST = 40
@@ -113,8 +116,8 @@ def fit(outcomes: list[Outcome], about: dict[str, Any]) -> Calibration:
     unseen = _out_of_fold(names, values, right)
     acceptable = np.where([ruled_out(outcome.signals) for outcome in outcomes], 0.0, unseen)
     threshold = threshold_for(acceptable, right, MOST_RISK)
-    if threshold is None:  # the surest answer is wrong: only what is surer than all of them may pass
-        threshold = 1.0
+    # Where the surest answer is wrong, only what is surer than all of them may pass.
+    threshold = 1.0 if threshold is None else max(threshold, LEAST_CONFIDENCE)
     accepted = accepted_at(acceptable, right, threshold)
     description = {
         **about,
