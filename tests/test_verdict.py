@@ -119,7 +119,7 @@ def test_no_rotation_of_a_sphere_is_determined() -> None:
     axes = tuple(FreeMotion("rotation", axis, np.zeros(3)) for axis in np.eye(3))
     seen = Observability(np.zeros(6), axes, np.eye(6), np.zeros(3), 500)
     (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
-    assert reason == "symmetric: no rotation is determined, as of a sphere"
+    assert reason == "symmetric: rotation is not determined about any axis, as of a sphere"
 
 
 def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:

@@ -157,7 +157,7 @@ def _doubts(
     if observability is None:
         doubts.append("too few points lie on each other to tell which motions are determined")
     elif sum(motion.kind == "rotation" for motion in observability.free) == 3:
-        doubts.append("symmetric: no rotation is determined, as of a sphere")
+        doubts.append("symmetric: rotation is not determined about any axis, as of a sphere")
     elif observability.free:
         said = " and ".join(motion_in_words(motion) for motion in observability.free)
         doubts.append(f"symmetric: {said} {'is' if len(observability.free) == 1 else 'are'} not determined")

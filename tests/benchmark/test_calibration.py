@@ -64,7 +64,7 @@ def test_the_clearer_the_signals_the_more_is_accepted() -> None:
         fit(outcomes(1000, 3, steepness), {}).description["out_of_fold"]["right_accepted"]
         for steepness in (4.0, 100.0)
     ]
-    assert shares[0] < shares[1] and shares[1] > 0.8
+    assert shares[1] > 3 * shares[0] and shares[1] > 0.7
 
 
 def test_where_the_surest_answer_is_wrong_nothing_is_trusted() -> None:

@@ -6,19 +6,24 @@ import pytest
 from tests.multiway.stubs import random_motion, write_scans
 from utopic_cli.errors import InputError, OutputError
 from utopic_cli.geometry.rigid import apply
+from utopic_cli.io import lzf
 from utopic_cli.io.ply_header import parse_header
 from utopic_cli.io.scan import read_scan
-from utopic_cli.multiway.colours import read_colours
-from utopic_cli.multiway.merge import LAYOUT, write_merged
+from utopic_cli.multiway.merge import write_merged
 from utopic_cli.multiway.scans import find_scans
 
 
 def read(path):
     data = path.read_bytes()
     header = parse_header(data)
-    table = np.frombuffer(data[header.size :], LAYOUT)
-    assert header.elements[0].count == len(table)
+    vertex = header.elements[0]
+    table = np.frombuffer(data[header.size :], [(p.name, p.dtype) for p in vertex.properties])
+    assert vertex.count == len(table)
     return table
+
+
+def colours_in(table):
+    return np.stack([table[name] for name in ("red", "green", "blue")], axis=1)
 
 
 def make(tmp_path, names=("a.ply", "b [1].ply")):
@@ -37,7 +42,7 @@ def test_every_point_of_every_scan_is_there_with_its_colour(tmp_path):
     for number, rows in ((0, slice(0, 200)), (1, slice(200, 400))):
         points = apply(group[number], read_scan(files[number].path).cloud.points)
         assert (np.stack([table[name][rows] for name in "xyz"], axis=1) == points).all()
-        assert (table["rgb"][rows] == 10 * number).all()
+        assert (colours_in(table)[rows] == 10 * number).all()
     assert len(read_scan(tmp_path / "m.ply").cloud) == 400
 
 
@@ -68,32 +73,123 @@ def test_cells_without_number_are_refused_and_nothing_is_left(tmp_path):
     assert (tmp_path / "m.ply").read_text() == "there"
 
 
+POINTS = np.random.default_rng(0).standard_normal((60, 3)).round(4)
+TEXTS = [" ".join(map(str, point)) for point in POINTS.tolist()]
+XYZ = [f"float {name}" for name in "xyz"]
+RGB = np.arange(180, dtype=np.uint8).reshape(60, 3)
+PACKED = RGB.astype(int) @ [[65536], [256], [1]]
+
+
 def ascii_ply(properties, rows):
     lines = ["ply", "format ascii 1.0", f"element vertex {len(rows)}"]
     return "\n".join([*lines, *(f"property {p}" for p in properties), "end_header", *rows]) + "\n"
 
 
-def test_colours_of_text_shorts_floats_and_none(tmp_path):
-    rng = np.random.default_rng(0)
-    points = [" ".join(map(str, p)) for p in rng.standard_normal((60, 3)).round(4)]
-    xyz = [f"float {name}" for name in "xyz"]
-    for kind, value, expected in (("uchar", "7", 7), ("ushort", "65535", 255), ("float", "0.5", 128)):
-        path = tmp_path / f"{kind}.ply"
-        properties = [f"{kind} {name}" for name in ("red", "green", "blue")]
-        path.write_text(ascii_ply([*xyz, *properties], [f"{p} {value} 0 0" for p in points]))
-        colours = read_colours(read_scan(path))
-        assert (colours == [expected, 0, 0]).all() and colours.dtype == np.uint8
-    (tmp_path / "none.ply").write_text(ascii_ply(xyz, points))
-    assert read_colours(read_scan(tmp_path / "none.ply")) is None
-    (tmp_path / "points.xyz").write_text("\n".join(points))
-    assert read_colours(read_scan(tmp_path / "points.xyz")) is None
+def pcd(fields, sizes, kinds, encoding, body):
+    lines = ["VERSION .7", f"FIELDS {fields}", f"SIZE {sizes}", f"TYPE {kinds}", f"WIDTH {len(POINTS)}"]
+    return "\n".join([*lines, "HEIGHT 1", f"DATA {encoding}\n"]).encode("ascii") + body
 
 
-def test_colours_stay_with_their_points_where_some_are_not_finite(tmp_path):
-    rng = np.random.default_rng(0)
-    rows = [f"{x:.3f} {y:.3f} {z:.3f} {i} 0 0" for i, (x, y, z) in enumerate(rng.standard_normal((60, 3)))]
-    rows[0], rows[30] = "nan 0 0 0 0 0", "0 nan 0 30 0 0"
-    names = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in ("red", "green", "blue"))]
-    (tmp_path / "a.ply").write_text(ascii_ply(names, rows))
-    colours = read_colours(read_scan(tmp_path / "a.ply"))
-    assert colours[:, 0].tolist() == [i for i in range(60) if i not in (0, 30)]
+def merged(folder, **contents):
+    """Merge files that lie as they should already, in the order given, named by their suffix."""
+    folder.mkdir()
+    paths = []
+    for i, (kind, content) in enumerate(contents.items()):
+        paths.append(folder / f"{i}.{kind.rstrip('_')}")
+        paths[-1].write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+    if len(paths) == 1:  # a batch has two at least
+        paths.append(folder / "other.xyz")
+        paths[-1].write_text("\n".join(TEXTS) + "\n")
+    files = dict(enumerate(find_scans(paths).scans))
+    write_merged(folder / "m.out", dict.fromkeys(files, np.eye(4)), files, seed=0)
+    return read(folder / "m.out")
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "expected"),
+    [("uchar", 7, 7), ("ushort", 65535, 255), ("float", 0.5, 128), ("int", 200, 200)],
+)
+def test_colours_in_any_range(tmp_path, kind, value, expected):
+    properties = [f"{kind} {name}" for name in ("red", "green", "blue")]
+    table = merged(tmp_path / "s", ply=ascii_ply([*XYZ, *properties], [f"{p} {value} 0 0" for p in TEXTS]))
+    assert (colours_in(table)[:60] == [expected, 0, 0]).all()
+    assert (colours_in(table)[60:] == 190).all()  # the scan without any is grey
+
+
+def rows_with(values):
+    return [f"{p} {' '.join(map(str, v))}" for p, v in zip(TEXTS, values.tolist(), strict=True)]
+
+
+def packed_pcd(encoding):
+    table = np.zeros(60, [("xyz", "<f4", 3), ("i", "<f4"), ("rgb", "<u4")])
+    table["xyz"], table["i"] = POINTS, np.arange(60)
+    # Opaque colours are NaN as a float: the bits have to come through.
+    table["rgb"] = (255 << 24) | RGB[:, 0].astype("u4") << 16 | RGB[:, 1].astype("u4") << 8 | RGB[:, 2]
+    if encoding == "binary":
+        return pcd("x y z intensity rgb", "4 4 4 4 4", "F F F F F", encoding, table.tobytes())
+    columns = [*table["xyz"].T, table["i"], table["rgb"]]
+    block = b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
+    stream = lzf.store(block)
+    body = np.array([len(stream), len(block)], "<u4").tobytes() + stream
+    return pcd("x y z intensity rgb", "4 4 4 4 4", "F F F F F", encoding, body)
+
+
+@pytest.mark.parametrize(
+    ("kind", "content"),
+    [
+        ("pcd", packed_pcd("binary")),
+        ("pcd", packed_pcd("binary_compressed")),
+        ("pcd", pcd("x y z rgb", "4 4 4 4", "F F F U", "ascii", "\n".join(rows_with(PACKED)).encode())),
+        ("obj", "\n".join(f"v {row}" for row in rows_with(RGB / 255))),
+        ("xyz", "\n".join(rows_with(RGB))),
+        ("pts", "60\n" + "\n".join(rows_with(np.column_stack([-np.arange(60), RGB])))),
+        ("txt", "//X Y Z R G B Intensity\n" + "\n".join(rows_with(np.column_stack([RGB, np.arange(60)])))),
+        ("csv", "x,y,z,red,green,blue\n" + "\n".join(row.replace(" ", ",") for row in rows_with(RGB))),
+    ],
+)  # fmt: skip
+def test_colours_of_every_format(tmp_path, kind, content):
+    assert (colours_in(merged(tmp_path / "s", **{kind: content}))[:60] == RGB).all()
+
+
+def test_scans_without_colours_are_told_apart(tmp_path):
+    colours = colours_in(merged(tmp_path / "s", xyz="\n".join(TEXTS), xyz_="\n".join(TEXTS[::-1])))
+    assert len(np.unique(colours[:60], axis=0)) == len(np.unique(colours[60:], axis=0)) == 1
+    assert (colours[0] != colours[60]).any()
+
+
+def test_fields_that_most_scans_have_are_kept(tmp_path):
+    numbers = np.arange(60)
+    names = ["float scalar_Intensity", "double gps time", "uchar label"]
+    ply = ascii_ply(
+        [*XYZ, *(name.replace(" time", "_time") for name in names)],
+        rows_with(np.column_stack([numbers, 1e9 + numbers / 7, numbers % 3])),
+    )
+    text = "x y z intensity gps_time\n" + "\n".join(rows_with(np.column_stack([-numbers, numbers])))
+    table = merged(tmp_path / "s", ply=ply, pcd=packed_pcd("binary"), xyz=text)
+    assert table.dtype.names == ("x", "y", "z", "red", "green", "blue", "scan", "intensity", "gps_time")
+    assert (table["intensity"] == [*numbers, *numbers, *-numbers]).all()  # in all of them
+    assert (table["gps_time"][:60] == 1e9 + numbers / 7).all()  # as exact as it was
+    assert np.isnan(table["gps_time"][60:120]).all() and (table["gps_time"][120:] == numbers).all()
+    assert (colours_in(table)[60:120] == RGB).all()
+
+
+def test_a_field_that_is_not_all_numbers_is_left_blank_and_our_own_names_stay_ours(tmp_path):
+    rows = rows_with(np.column_stack([np.arange(60), np.ones((60, 2))]))
+    header = "x,y,z,scan,of row,red\n"
+    late = [row.replace(" ", ",") for row in rows * 10]
+    late[-1] = late[-1].rsplit(",", 2)[0] + ",none,1"
+    table = merged(tmp_path / "s", csv=header + "\n".join(late), csv_=header + "\n".join(late[:60]))
+    assert table.dtype.names[6:] == ("scan", "scan_", "of_row")
+    assert (table["scan"] == np.repeat([0, 1], [600, 60])).all()
+    assert (table["scan_"][:60] == np.arange(60)).all()
+    assert np.isnan(table["of_row"][:600]).all() and (table["of_row"][600:] == 1).all()
+
+
+def test_values_stay_with_their_points_where_some_are_not_finite(tmp_path):
+    rows = rows_with(np.column_stack([np.arange(60), np.zeros((60, 2)), np.arange(60)]))
+    rows[0], rows[30] = "nan 0 0 0 0 0 0", "0 nan 0 30 0 0 30"
+    properties = [*XYZ, *(f"uchar {name}" for name in ("red", "green", "blue")), "float intensity"]
+    ply = ascii_ply(properties, rows)
+    table = merged(tmp_path / "s", ply=ply, ply_=ply + "\n")
+    expected = [i for i in range(60) if i not in (0, 30)] * 2
+    assert table["red"].tolist() == expected == table["intensity"].tolist()
