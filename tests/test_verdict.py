@@ -130,6 +130,12 @@ def test_a_trusted_answer_still_names_what_speaks_against_it() -> None:
     assert praise == "taken together, the signs speak for it" and "agree only 50% as well" in doubt
 
 
+def test_an_answer_that_another_sampling_does_not_give_again_is_never_trusted() -> None:
+    found = verdict({"spread": -0.4})
+    assert not found.trusted and found.confidence == verdict().confidence
+    assert found.reasons == ("another sampling of the same scans gave another answer",)
+
+
 def test_scans_that_contradict_each_other_are_never_trusted_however_likely_the_answer() -> None:
     found = verdict({"conflict": -0.7})
     assert not found.trusted and found.confidence == verdict().confidence

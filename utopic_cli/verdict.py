@@ -51,8 +51,7 @@ class Verdict:
 
     Attributes:
         confidence: calibrated probability that it is right; None without a calibration.
-        trusted: whether to rely on it; never without a calibration, nor where a motion is left free
-            or the scans contradict each other.
+        trusted: whether to rely on it; never without a calibration, nor what is ``ruled_out``.
         reasons: why, most telling first.
     """
 
@@ -87,10 +86,11 @@ def read_calibration(card: dict[str, Any]) -> Calibration | None:
 def ruled_out(signals: dict[str, float]) -> bool:
     """Tell whether an answer is not to be trusted, however likely it is.
 
-    Along a motion that the surfaces leave free it is right by luck alone, and scans that contradict
-    each other can't both be right.
+    Along a motion that the surfaces leave free it is right by luck alone; scans that contradict
+    each other can't both be right, nor can two answers to two samplings of the same scans.
     """
-    return signals["fixed"] < np.log10(FREE) or signals["conflict"] > MOST_CONFLICT
+    undetermined, contradicted = signals["fixed"] < np.log10(FREE), signals["conflict"] > MOST_CONFLICT
+    return bool(undetermined or contradicted or signals["spread"] > APART)
 
 
 def judge(
