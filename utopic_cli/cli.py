@@ -5,6 +5,7 @@ Everything heavy is imported inside the commands, so that ``--help`` is instant.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import traceback
@@ -18,6 +19,8 @@ from utopic_cli.commands.align import align
 from utopic_cli.commands.batch import batch
 from utopic_cli.commands.bench import bench
 from utopic_cli.commands.bench_confidence import confidence
+from utopic_cli.commands.bench_curves import mount as mount_curves
+from utopic_cli.commands.bench_speed import speed
 from utopic_cli.commands.calibrate import calibrate
 from utopic_cli.commands.console import debug_wanted
 from utopic_cli.commands.demo import demo
@@ -111,6 +114,8 @@ app.command()(info)
 app.command()(train)
 app.command()(calibrate)
 bench.command()(confidence)
+mount_curves(bench)
+bench.command()(speed)
 app.add_typer(bench, name="bench")
 
 
@@ -118,6 +123,8 @@ def main() -> None:
     """Entry point of the ``utopic`` command."""
     # Asked to end by a scheduler or ``timeout``: tidy up as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Threads that spin while they wait for each other make a busy machine two to four times slower.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     app(prog_name="utopic")
 
 

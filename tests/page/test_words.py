@@ -15,7 +15,7 @@ from utopic_cli.page.words import decimals, facts, percent, vector, verdict
     [
         (True, 0.973, "yes", "Aligned and trusted Confidence 97%", "wrong"),
         (False, 0.31, "no", "do not trust it Confidence 31%", "and trusted"),
-        (False, None, "none", "No verdict: uncalibrated weights", "trusted"),
+        (False, None, "none", "No verdict", "trusted"),
         (True, None, "none", "No verdict", "trusted"),  # nothing vouches for it
     ],
 )

@@ -279,7 +279,9 @@ def _verdict(result: RegistrationResult) -> str:
     if result.confidence is None:
         return "aligned, but nothing says how well: do not trust it unseen"
     verdict = "aligned" if result.trusted else "aligned, but do not trust it"
-    return f"{verdict}; confidence {result.confidence:.0%}"
+    # Never "100%": it is an estimate.
+    said = "over 99%" if result.confidence > 0.99 else f"{result.confidence:.0%}"
+    return f"{verdict}; confidence {said}"
 
 
 def _to_stdout(data: bytes) -> None:

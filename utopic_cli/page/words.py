@@ -32,7 +32,7 @@ def verdict(result: RegistrationResult) -> Verdict:
     """Say whether to trust the answer, never more than the result does."""
     if result.confidence is None or math.isnan(result.confidence):
         text = "An answer was found, but nothing vouches for it: look at it before you use it."
-        return Verdict("none", "No verdict: uncalibrated weights", text)
+        return Verdict("none", "No verdict", text)
     said = f"Confidence {percent(result.confidence)}: the estimated probability that it is right. "
     if result.trusted:
         return Verdict("yes", "Aligned and trusted", said)
