@@ -62,7 +62,7 @@ def test_scans_of_one_object_come_into_one_frame(tmp_path):
     assert [row["kind"] for row in summary].count("pair") == 10
     assert (out / "pairs" / "s1--s0.json").is_file()
     page = (out / "report.html").read_text()
-    assert "5 of 5 files placed" in page and "<svg" in page and "http" not in page
+    assert "5 of 5 scans placed, in one group" in page and "<svg" in page
     merged = read_scan(out / "merged.ply").cloud.points
     assert len(merged) == 1000
     assert np.linalg.norm(merged[:200] - merged[800:], axis=1).max() < 0.1  # the same points, nearly
@@ -272,3 +272,67 @@ def test_odd_names_go_all_the_way(tmp_path):
         tmp_path / "out" / "pairs" / "[b]_--two words.json"
     ).exists()
     assert b"<i>" not in (tmp_path / "out" / "report.html").read_bytes()
+
+
+def test_the_first_scan_is_the_first_that_can_be_read(tmp_path):
+    write_scans(tmp_path / "scans", ["b.ply", "c.ply", "d.ply"])
+    (tmp_path / "scans" / "a.ply").write_bytes(b"ply\nnothing")
+    outcome = run(tmp_path, pairs="to-first")
+    assert [entry["pair"] for entry in poses(tmp_path)["pairs"]] == ["c--b", "d--b"]
+    assert outcome.exit_code == 6 and len(outcome.model.groups) == 1
+
+
+def test_scans_where_results_go_are_refused_and_stay(tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply"])
+    listed = (tmp_path / "scans" / "a.ply", tmp_path / "scans" / "b.ply")
+    for inputs, out in (
+        ((tmp_path / "scans",), tmp_path),  # where descriptions of scans would be written
+        (listed, tmp_path / "scans"),
+    ):
+        with pytest.raises(UsageError, match="lies where the results go"):
+            run_batch(BatchRequest(inputs, out, overwrite=True))
+    (tmp_path / "out" / "pairs").mkdir(parents=True)
+    own = tmp_path / "out" / "pairs" / "mine.json"
+    own.write_text("{}")
+    run(tmp_path, overwrite=True)
+    assert own.read_text() == "{}"  # only records are cleared
+
+
+def test_what_was_out_of_reach_is_tried_again_and_leftovers_go(tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply", "c.ply"])
+    content = (tmp_path / "scans" / "c.ply").read_bytes()
+    out = tmp_path / "out"
+    run(tmp_path)
+    whole = (out / "poses.json").read_bytes()
+    record = json.loads((out / "scans" / "c.json").read_text())
+    record.pop("description")
+    (out / "scans" / "c.json").write_text(json.dumps({**record, "status": "refused", "problem": "away"}))
+    (out / "pairs" / ".utopic-0123.tmp").write_bytes(content)
+    (out / ".utopic-4567.tmp").write_bytes(content)
+    assert run(tmp_path, resume=True).exit_code == 0
+    assert (out / "poses.json").read_bytes() == whole
+    assert not list(out.rglob(".utopic-*"))
+
+
+def test_a_batch_begun_anew_is_not_whole_until_it_is(tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply"])
+    run(tmp_path)
+    for name in ("a.ply", "b.ply"):
+        (tmp_path / "scans" / name).write_text("no scan any more")
+    with pytest.raises(InputError, match="none of 2 scans"):
+        run(tmp_path, overwrite=True)
+    assert not (tmp_path / "out" / "poses.json").exists()
+
+
+def test_a_file_name_that_several_scans_have_is_no_name(tmp_path):
+    for seed, folder in enumerate(("one", "two")):
+        write_scans(tmp_path / folder, ["a.ply", f"{folder}.ply"], seed=seed)
+    listed = tmp_path / "pairs.csv"
+    inputs = (tmp_path / "one", tmp_path / "two")
+    for text, reason in (("a.ply,one\n", "several files"), ("a,b" + "c" * 200_000, "line 1 is no CSV")):
+        listed.write_text(text)
+        with pytest.raises(InputError, match=reason):
+            plan_batch(BatchRequest(inputs, tmp_path / "out", pairs=str(listed)))
+    listed.write_text(f"{tmp_path / 'two' / 'a.ply'},one\n")
+    plan = plan_batch(BatchRequest(inputs, tmp_path / "out", pairs=str(listed)))
+    assert [plan.scans.scans[i].path.parent.name for i in plan.first[0]] == ["two", "one"]

@@ -52,8 +52,8 @@ def batch(
         bool,
         typer.Option(
             "--merge",
-            help="Write merged.ply: all scans of the largest group, colours kept, the field 'scan' says "
-            "which; merged-2.ply and so on for further groups.",
+            help="Write merged.ply: all scans of the largest group, colours and the scalar fields of most "
+            "scans kept, the field 'scan' says which; merged-2.ply and so on for further groups.",
             rich_help_panel=_OUTPUTS,
         ),
     ] = False,

@@ -6,24 +6,24 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from utopic_cli import __version__
 from utopic_cli.config import AlignOptions
-from utopic_cli.errors import InputError, OutputError
+from utopic_cli.errors import InputError
 from utopic_cli.io.output import write_together
+from utopic_cli.multiway import folder
 from utopic_cli.multiway import pairs as choice
 from utopic_cli.multiway.edges import ScanShape
-from utopic_cli.multiway.journal import KINDS, Journal, fingerprint
+from utopic_cli.multiway.journal import Journal, fingerprint
 from utopic_cli.multiway.lock import locked
 from utopic_cli.multiway.merge import write_merged
 from utopic_cli.multiway.model import Model, build_model
 from utopic_cli.multiway.outcome import BatchOutcome, ScanEntry, pair_name
 from utopic_cli.multiway.page import batch_page
-from utopic_cli.multiway.plan import BatchPlan, BatchRequest, plan_batch
+from utopic_cli.multiway.plan import BatchPlan, BatchRequest, first_pairs, plan_batch
 from utopic_cli.multiway.scans import ScanFile
 from utopic_cli.multiway.tables import poses_csv, poses_json, poses_txt, summary_csv
 from utopic_cli.multiway.tasks import DescribeJob, RegisterJob, ScanRef, make_worker
@@ -32,7 +32,7 @@ from utopic_cli.multiway.workers import Task, Workers
 Progress = Callable[[str], None]
 Record = dict[str, Any]
 
-RECORD_VERSION = 1
+RECORD_VERSION = 2
 CONTENT = {"scans": "description", "pairs": "report"}
 
 
@@ -82,11 +82,15 @@ class _Batch:
         plan = plan_batch(request)
         self._files = plan.scans.scans
         self._weights = _weights(self._options)
-        _make_folder(request.out_dir)
+        folder.make_folder(request.out_dir)
         with locked(request.out_dir):
-            _check_earlier(request)
+            if not (request.resume or request.overwrite):
+                folder.check_earlier(request.out_dir)
             self._journal = Journal(request.out_dir)
+            folder.sweep(request.out_dir)
             if request.overwrite:
+                # First the mark of a whole set, which it no longer is.
+                (request.out_dir / "poses.json").unlink(missing_ok=True)
                 self._journal.clear()
             with Workers(
                 self._make_task, request.workers, request.timeout_s, self._options.threads
@@ -126,7 +130,9 @@ class _Batch:
                 if plan.first is None:
                     descriptors[number] = np.array(content["descriptor"])
         records: dict[choice.Pair, Record] = {}
-        todo = list(plan.first) if plan.first is not None else choice.similar_pairs(descriptors)
+        # Neighbours, and the first, are those among the scans that turned out to be readable.
+        first = None if plan.first is None else first_pairs(self._request.pairs, plan.scans, sorted(shapes))
+        todo = list(first) if first is not None else choice.similar_pairs(descriptors)
         rounds = choice.MOST_ROUNDS if plan.first is None else 1
         model = build_model(records, shapes)
         while todo and rounds:
@@ -211,6 +217,7 @@ class _Batch:
         return BatchOutcome(
             tuple(entries),
             model,
+            {n: record["description"] for n, record in described.items() if record["status"] == "done"},
             records,
             (*plan.scans.notes, *warnings),
             self._weights,
@@ -227,7 +234,7 @@ class _Batch:
         if self._request.merge:
             files = dict(enumerate(self._files))
             for number, group in enumerate(outcome.model.groups, 1):
-                merged.append(out / merged_name(number))
+                merged.append(out / folder.merged_name(number))
                 write_merged(
                     merged[-1],
                     group.T_world_scan,
@@ -247,7 +254,7 @@ class _Batch:
             contents[out / "report.html"] = batch_page(outcome)
         contents[out / "poses.json"] = poses_json(outcome)
         write_together(contents, overwrite=True)
-        for path in _results(out):  # of an earlier run, and not of this one
+        for path in folder.results(out):  # of an earlier run, and not of this one
             if path not in contents and path not in merged:
                 path.unlink(missing_ok=True)
 
@@ -275,11 +282,6 @@ class _Pace:
         self._progress(f"{done}/{self._total} {self._kind}, {left}: {name}")
 
 
-def merged_name(group: int) -> str:
-    """Return the file name of a group's merged cloud; groups count from 1."""
-    return "merged.ply" if group == 1 else f"merged-{group}.ply"
-
-
 def _weights(options: AlignOptions) -> dict[str, str]:
     """Make sure that the network can be loaded before any work, and say which it is."""
     from utopic_cli.bridge import load_network
@@ -287,31 +289,6 @@ def _weights(options: AlignOptions) -> dict[str, str]:
     _, card = load_network(options.weights, options.device)
     # The card holds the calibration of the verdict, which is not in the weights' own hash.
     return {"name": str(card["name"]), "sha256": str(card["sha256"]), "card": fingerprint(card)}
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: the folder can't be made ({error.strerror})") from None
-
-
-def _check_earlier(request: BatchRequest) -> None:
-    """Refuse to mix with an earlier batch unless told what to do with it."""
-    if request.resume or request.overwrite:
-        return
-    out = request.out_dir
-    earlier = [path for kind in KINDS for path in (out / kind).glob("*.json")] + _results(out)
-    if earlier:
-        raise OutputError(
-            f"{out}: holds an earlier batch; pass --resume to go on with it or --overwrite to begin anew"
-        )
-
-
-def _results(out: Path) -> list[Path]:
-    """Return the results that are in a folder."""
-    names = ("poses.json", "poses.txt", "poses.csv", "summary.csv", "report.html", "merged.ply")
-    return [path for path in (*(out / name for name in names), *out.glob("merged-*.ply")) if path.is_file()]
 
 
 def _why_alone(number: int, model: Model) -> str:

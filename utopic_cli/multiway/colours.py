@@ -1,55 +1,59 @@
-"""The colours a scan's points have in their file."""
+"""The colours of points: as their file has them, or one for each scan."""
 
 from __future__ import annotations
 
+import colorsys
+from collections.abc import Mapping
+
 import numpy as np
 
-from utopic_cli.errors import InputError
-from utopic_cli.io.ascii_table import parse_table
-from utopic_cli.io.files import read_bytes
-from utopic_cli.io.ply_header import parse_header
-from utopic_cli.io.records import FormatError
-from utopic_cli.io.scan import Scan
+from utopic_cli.multiway.fields import COLOURS, PACKED
 
-_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_GOLDEN = 0.6180339887498949  # of a turn: neighbouring numbers get unlike hues
 
 
-def read_colours(scan: Scan) -> np.ndarray | None:
-    """Return the colours of a scan's finite points, or None if its file has none that are known.
+def has_colours(names: Mapping[str, object]) -> bool:
+    """Tell whether fields of these names hold colours."""
+    return names.keys() >= set(COLOURS) or PACKED in names
 
-    PLY files whose vertices come first, without lists, as scanners and viewers write them;
-    integers by their range, floats from 0 to 1.
+
+def colour_fields(names: Mapping[str, object]) -> tuple[str, ...]:
+    """Return which fields ``colours_of`` needs, none if there are no colours."""
+    if names.keys() >= set(COLOURS):
+        return COLOURS
+    return (PACKED,) if PACKED in names else ()
+
+
+def colours_of(values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return colours as bytes.
+
+    Bytes stay as they are. Files declare other numbers loosely: all up to 1 where numbers are
+    fractions, up to 255, or up to 65535; the largest tells which.
+
+    Args:
+        values: (N,) by name, see ``colour_fields``; packed: the bits 0x00RRGGBB of 4 bytes.
 
     Returns:
-        (N, 3) uint8 red, green, blue, or None.
-
-    Raises:
-        InputError: the file has changed since it was read.
+        (N, 3) uint8 red, green, blue.
     """
-    if scan.format != "ply":
-        return None
-    data = read_bytes(scan.path)
-    try:
-        header = parse_header(data)
-        vertex = header.elements[0]
-        places = {p.name: i for i, p in enumerate(vertex.properties)}
-        names = next((names for names in _NAMES if places.keys() >= set(names)), None)
-        if names is None or vertex.name != "vertex" or vertex.has_lists:
-            return None
-        dtypes = [vertex.properties[places[name]].dtype for name in names]
-        if vertex.count != scan.records:
-            raise FormatError("has changed while it was read; run again")
-        body = memoryview(data)[header.size :]
-        if header.order:
-            layout = np.dtype([(p.name, p.dtype) for p in vertex.properties])
-            table = np.frombuffer(body, layout, vertex.count)
-            values = np.stack([table[name].astype(np.float64) for name in names], axis=1)
-        else:
-            lines = [line for line in bytes(body).splitlines() if line.strip()][: vertex.count]
-            wanted = [places[name] for name in names]
-            values = parse_table(lines, len(vertex.properties), wanted, lambda i: f"its PLY vertex {i}")
-    except (FormatError, ValueError) as error:
-        raise InputError(f"{scan.path}: {error}") from None
-    largest = [float(np.iinfo(dtype).max) if dtype.kind in "iu" else 1.0 for dtype in dtypes]
-    shares = np.nan_to_num(values[scan.kept] / largest, nan=0.0)
-    return np.rint(255.0 * np.clip(shares, 0.0, 1.0)).astype(np.uint8)
+    if PACKED in values:
+        stored = values[PACKED]
+        bits = stored.view(f"u{stored.itemsize}") if stored.dtype.kind == "f" else stored
+        if stored.dtype.kind == "f" and stored.itemsize == 8:
+            bits = stored.astype(np.float32).view(np.uint32)
+        packed = bits.astype(np.int64)
+        return np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+    three = [values[name] for name in COLOURS]
+    if all(channel.dtype == np.uint8 for channel in three):
+        return np.stack(three, axis=1)
+    table = np.nan_to_num(np.stack([channel.astype(np.float64) for channel in three], axis=1))
+    largest = table.max(initial=0.0)
+    fractions = all(channel.dtype.kind == "f" for channel in three)
+    full = 1.0 if fractions and largest <= 1.0 else 255.0 if largest <= 255.0 else 65535.0
+    return np.rint(255.0 * np.clip(table / full, 0.0, 1.0)).astype(np.uint8)
+
+
+def scan_colour(number: int) -> tuple[int, int, int]:
+    """Return a colour to tell a scan by, its number counting from 0."""
+    parts = colorsys.hsv_to_rgb((0.58 + number * _GOLDEN) % 1.0, 0.62, 0.9)
+    return tuple(round(255 * part) for part in parts)  # type: ignore[return-value]

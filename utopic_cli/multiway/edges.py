@@ -82,6 +82,7 @@ class Edge:
         centre: (3,) middle of the overlap there.
         overlap: the smaller share of the two scans that overlaps.
         rivals: how many other answers fit nearly as well.
+        alternatives: (4, 4) of each, between the centred scans.
     """
 
     source: int
@@ -93,6 +94,7 @@ class Edge:
     centre: np.ndarray
     overlap: float
     rivals: int = 0
+    alternatives: tuple[np.ndarray, ...] = ()
 
 
 def make_edge(
@@ -137,4 +139,5 @@ def make_edge(
         apply(to_centred, np.array(report["covariance_about"])),
         float(min(overlap.values())),
         len(report["ambiguous_with"]),
+        tuple(to_centred @ np.array(rival) @ from_centred for rival in report["ambiguous_with"]),
     ), ""

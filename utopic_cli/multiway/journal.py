@@ -17,6 +17,8 @@ from utopic_cli.io.output import write_atomically
 
 KINDS = ("scans", "pairs")
 
+_MARK_WITHIN = 64  # bytes: the fingerprint is what a record begins with
+
 
 def fingerprint(content: Any) -> str:
     """Return the sha256 of JSON-ready data."""
@@ -49,7 +51,9 @@ class Journal:
             return None
         if not isinstance(record, dict) or record.get("fingerprint") != mark:
             return None
-        return record if record.get("status") in ("done", "refused") else None
+        # A scan that could not be read may have been out of reach; to look again costs little.
+        lasting = ("done", "refused") if kind == "pairs" else ("done",)
+        return record if record.get("status") in lasting else None
 
     def commit(self, kind: str, name: str, mark: str, record: dict[str, Any]) -> dict[str, Any]:
         """Write a record and return it as it will be read back.
@@ -67,7 +71,7 @@ class Journal:
         return self._folder / kind / f"{name}.json"
 
     def clear(self) -> None:
-        """Remove all records.
+        """Remove all records; other files stay.
 
         Raises:
             OutputError: one can't be removed.
@@ -75,6 +79,7 @@ class Journal:
         for kind in KINDS:
             for path in (self._folder / kind).glob("*.json"):
                 try:
-                    path.unlink()
+                    if b'"fingerprint"' in path.read_bytes()[:_MARK_WITHIN] or not path.stat().st_size:
+                        path.unlink()
                 except OSError as error:
                     raise OutputError(f"{path}: can't be removed ({error.strerror})") from None

@@ -18,12 +18,12 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from utopic_cli.geometry.rigid import invert
-from utopic_cli.multiway.edges import Edge, ScanShape
+from utopic_cli.multiway.edges import LEAST, Edge, ScanShape
 
 CLOSES = 0.03
 """A loop of three closes if it moves the points of its first scan by no more than this share of its size."""
@@ -68,6 +68,43 @@ def agreement(chance: float, rivals: int) -> float:
 def disagreement(chance: float) -> float:
     """Return by how much it changes them when it disagrees: a negative number."""
     return math.log(1.0 - chance)
+
+
+def settle_rivals(edges: Sequence[Edge], shapes: Mapping[int, ScanShape]) -> list[Edge]:
+    """Take a rival in place of an answer where loops speak against the answer and for the rival.
+
+    Only triangles whose other two pairs have no rivals are asked: symmetric scans can be put together
+    in several ways all of whose loops close. What is taken is never trusted by itself.
+
+    Args:
+        edges: at most one for any two scans.
+        shapes: of the scans, by index.
+
+    Returns:
+        The edges, some with another transformation.
+    """
+    sure: dict[int, dict[int, Edge]] = defaultdict(dict)
+    for edge in edges:
+        if not edge.rivals:
+            sure[edge.source][edge.target] = sure[edge.target][edge.source] = edge
+    return [_settled(edge, sure, shapes) if edge.alternatives else edge for edge in edges]
+
+
+def _settled(edge: Edge, sure: Mapping[int, dict[int, Edge]], shapes: Mapping[int, ScanShape]) -> Edge:
+    answers = (edge.T_target_source, *edge.alternatives)
+    votes = np.zeros(len(answers))
+    beside, beyond = sure.get(edge.source, {}), sure.get(edge.target, {})
+    for third in sorted(beside.keys() & beyond.keys()):
+        chance = beside[third].prior * beyond[third].prior
+        back = invert(_along(beside[third], edge.source)) @ _along(beyond[third], edge.target)
+        for i, answer in enumerate(answers):
+            closes = shapes[edge.source].displacement(back @ answer) <= CLOSES
+            votes[i] += agreement(chance, edge.rivals) if closes else disagreement(chance)
+    best = int(np.argmax(votes))
+    if not best or votes[best] <= 0.0 or votes[0] >= 0.0:
+        return edge
+    prior = max(LEAST, min(edge.prior, (1.0 - edge.prior) / edge.rivals))
+    return replace(edge, T_target_source=answers[best], prior=prior, trusted=False)
 
 
 def believe(edges: Sequence[Edge], shapes: Mapping[int, ScanShape]) -> list[Belief]:

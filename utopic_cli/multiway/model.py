@@ -12,10 +12,12 @@ import numpy as np
 from utopic_cli.geometry.rigid import invert, rigid
 from utopic_cli.multiway.edges import Edge, ScanShape, make_edge
 from utopic_cli.multiway.groups import find_groups
-from utopic_cli.multiway.loops import Belief, believe
+from utopic_cli.multiway.loops import Belief, believe, settle_rivals
 from utopic_cli.multiway.pose_graph import settle
 
 USED, REJECTED, UNCONFIRMED, UNUSABLE, FAILED = "used", "rejected", "unconfirmed", "unusable", "failed"
+
+INSTEAD = "not as answered but as another pose that fits about as well (ambiguous_with): loops say so"
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class PairAnswer:
         verdict: ``used``; ``rejected``: it contradicts the pose graph; ``unconfirmed``: between
             groups, and neither trusted by itself nor confirmed by loops; ``unusable``: it can't be
             an edge; ``failed``: there is no answer.
-        reason: why, in plain words; empty for ``used``.
+        reason: why, in plain words; of what is ``used`` only where a rival answer is.
         belief: what triangles say of it, or None.
         missed: by how much the final transformations miss it, as a share of the source's size.
         prior: chance that it is right from the pair alone, or None.
@@ -98,6 +100,8 @@ def build_model(records: Mapping[tuple[int, int], Mapping[str, Any]], shapes: di
         else:
             number_of[source, target] = len(edges)
             edges.append(edge)
+    given = edges
+    edges = settle_rivals(edges, shapes)
     beliefs = believe(edges, shapes)
     used: set[int] = set()
     missed: dict[int, float] = {}
@@ -115,7 +119,7 @@ def build_model(records: Mapping[tuple[int, int], Mapping[str, Any]], shapes: di
     for pair, number in number_of.items():
         edge, belief = edges[number], beliefs[number]
         if number in used:
-            verdict, reason = USED, ""
+            verdict, reason = USED, "" if edge is given[number] else INSTEAD
         elif number in missed:
             verdict, reason = REJECTED, f"contradicts the group by {missed[number]:.1%} of the scan's size"
         elif belief.disagree > belief.agree:

@@ -51,6 +51,7 @@ class BatchOutcome:
     Attributes:
         scans: every input file, in order; scan numbers elsewhere are places in it.
         model: groups and pairs.
+        described: by number of the scans that could be read, see ``tasks.describe``.
         records: by (source, target), as the journal keeps them.
         notes: what a user should know about the inputs.
         weights: name and sha256.
@@ -62,6 +63,7 @@ class BatchOutcome:
 
     scans: tuple[ScanEntry, ...]
     model: Model
+    described: Mapping[int, Mapping[str, Any]]
     records: Mapping[tuple[int, int], Mapping[str, Any]]
     notes: tuple[str, ...]
     weights: dict[str, str]

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,15 +95,17 @@ def read_pairs(path: Path, scans: Sequence[ScanFile]) -> list[Pair]:
         InputError: the file can't be read, or a line (named) has not two known, different scans.
     """
     known: dict[str, int] = {}
+    several = {name for name, n in Counter(scan.path.name for scan in scans).items() if n > 1}
     for number, scan in enumerate(scans):
-        for text in (str(scan.path), scan.path.name, scan.name):
-            known.setdefault(text, number)
+        known[scan.path.name] = number
     for number, scan in enumerate(scans):
-        known[scan.name] = number  # names are distinct, file names in several folders are not
+        known[str(scan.path)] = number  # paths and names are distinct, file names are not
+    for number, scan in enumerate(scans):
+        known[scan.name] = number
     text = read_bytes(path).decode("utf-8-sig", "surrogateescape")
     pairs: dict[Pair, Pair] = {}
     rows = csv.reader(io.StringIO(text, newline=""))
-    for row in rows:
+    for row in _sound(path, rows):
         cells = [cell.strip() for cell in row]
         line = rows.line_num
         if not any(cells) or cells[0].startswith("#") or (line == 1 and cells[:2] == ["source", "target"]):
@@ -110,6 +113,10 @@ def read_pairs(path: Path, scans: Sequence[ScanFile]) -> list[Pair]:
         if len(cells) < 2:
             raise InputError(f"{path}: line {line} has no second column; write source,target")
         for cell in cells[:2]:
+            if cell in several:
+                raise InputError(
+                    f"{path}: line {line} names {cell!r}, which several files are called; give a path"
+                )
             if cell not in known:
                 raise InputError(f"{path}: line {line} names {cell!r}, which is no scan of this batch")
         source, target = known[cells[0]], known[cells[1]]
@@ -119,6 +126,14 @@ def read_pairs(path: Path, scans: Sequence[ScanFile]) -> list[Pair]:
     if not pairs:
         raise InputError(f"{path}: holds no pair; write source,target in each line")
     return list(pairs.values())
+
+
+def _sound(path: Path, rows: Any) -> Iterator[list[str]]:
+    """Yield the rows of a CSV reader; what it can't split into cells is an input error."""
+    try:
+        yield from rows
+    except csv.Error as error:
+        raise InputError(f"{path}: line {rows.line_num} is no CSV ({error}); export it again") from None
 
 
 def _between(model: Model, descriptors: Mapping[int, np.ndarray], known: set[Pair]) -> list[Pair]:

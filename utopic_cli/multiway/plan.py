@@ -10,6 +10,7 @@ from pathlib import Path
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
 from utopic_cli.multiway import pairs as choice
+from utopic_cli.multiway.journal import KINDS
 from utopic_cli.multiway.scans import ScanList, find_scans
 
 
@@ -72,11 +73,31 @@ def plan_batch(request: BatchRequest) -> BatchPlan:
     if request.resume and request.overwrite:
         raise UsageError("--resume keeps what is done and --overwrite discards it; choose one")
     scans = find_scans(request.inputs)
+    _keep_apart(scans, request.out_dir)
     usable = tuple(i for i, scan in enumerate(scans.scans) if scan.sha256 and scan.copy_of is None)
-    return BatchPlan(scans, usable, _first_pairs(request.pairs, scans, usable))
+    return BatchPlan(scans, usable, first_pairs(request.pairs, scans, usable))
 
 
-def _first_pairs(mode: str, scans: ScanList, usable: Sequence[int]) -> tuple[choice.Pair, ...] | None:
+def _keep_apart(scans: ScanList, out_dir: Path) -> None:
+    """Refuse scans that lie where results are written, and replaced."""
+    own = {os.path.realpath(folder) for folder in (out_dir, *(out_dir / kind for kind in KINDS))}
+    for scan in scans.scans:
+        if os.path.realpath(scan.path.parent) in own:
+            raise UsageError(f"{scan.path}: lies where the results go; choose another --out-dir")
+
+
+def first_pairs(mode: str, scans: ScanList, usable: Sequence[int]) -> tuple[choice.Pair, ...] | None:
+    """Return the pairs to begin with; None where the scans have to be described first.
+
+    Args:
+        mode: see ``BatchRequest.pairs``.
+        scans: all scans.
+        usable: numbers of those that can be aligned, ascending.
+
+    Raises:
+        InputError: the list of pairs is not sound.
+        UsageError: there is no such mode.
+    """
     if mode == "all" or (mode == "auto" and len(usable) <= choice.FEW_SCANS):
         return tuple(choice.every_pair(usable))
     if mode == "auto":

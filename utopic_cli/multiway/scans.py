@@ -126,7 +126,10 @@ def natural_order(path: Path) -> tuple[object, ...]:
 
 def _expanded(given: Path) -> list[tuple[Path, bool]]:
     if given.is_dir():
-        inside = sorted((path for path in given.iterdir() if _is_scan(path)), key=natural_order)
+        try:
+            inside = sorted((path for path in given.iterdir() if _is_scan(path)), key=natural_order)
+        except OSError as error:
+            raise InputError(f"{given}: can't be listed ({error.strerror}); check its permissions") from None
         return [(path, path.suffix.lower() in DOUBTFUL_SUFFIXES) for path in inside]
     if os.path.lexists(given):
         return [(given, False)]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,13 @@ import numpy as np
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError
 from utopic_cli.io.scan import Scan, read_scan
+from utopic_cli.multiway.workers import NotNow
 
 MOST_POINTS_HELD = 6_000_000
 """A worker remembers scans up to this many points together, two at least."""
+
+SAMPLE = 2000
+"""Points of a scan that its description holds, to draw it."""
 
 DESCRIPTOR_DECIMALS = 4
 
@@ -50,7 +55,8 @@ Job = DescribeJob | RegisterJob
 def make_worker(options: AlignOptions) -> Callable[[Job], dict[str, Any]]:
     """Return the task of one process: a job in, its record out.
 
-    The task raises ``InputError`` for what can't be read or registered.
+    The task raises ``InputError`` for scans that can't be read or pairs that can't be registered, and
+    ``NotNow`` for pairs of scans that could be read before.
     """
     from utopic_cli.bridge import load_network
 
@@ -60,7 +66,11 @@ def make_worker(options: AlignOptions) -> Callable[[Job], dict[str, Any]]:
     def work(job: Job) -> dict[str, Any]:
         if isinstance(job, DescribeJob):
             return describe(reader(job.scan), options, job.descriptor)
-        return register(reader(job.source), reader(job.target), options)
+        try:
+            both = reader(job.source), reader(job.target)
+        except InputError as error:  # it could be read when it was described
+            raise NotNow(str(error)) from None
+        return register(*both, options)
 
     return work
 
@@ -69,21 +79,32 @@ def describe(scan: Scan, options: AlignOptions, descriptor: bool) -> dict[str, A
     """Return a scan's size and shape as JSON-ready data.
 
     Keys: ``points``; ``centroid`` (3) and ``moments`` (3, 3), the covariance of the points, file
-    units; ``warnings``; ``descriptor`` if asked for, see ``pooled_descriptor``.
+    units; ``warnings``; ``sample``, see ``sample_of``; ``descriptor`` if asked for, see
+    ``pooled_descriptor``.
     """
     points = scan.cloud.points
     centroid = points.mean(axis=0)
     centred = points - centroid
+    rng = np.random.default_rng(options.seed)
+    drawn = np.sort(rng.choice(len(points), min(SAMPLE, len(points)), replace=False))
     record = {
         "points": len(points),
         "centroid": centroid.tolist(),
         "moments": (centred.T @ centred / len(points)).tolist(),
         "warnings": list(scan.warnings),
+        # As text it is small on the disk and in memory, however many scans there are.
+        "sample": base64.b64encode(centred[drawn].astype("<f4").tobytes()).decode("ascii"),
     }
     if descriptor:
         pooled = pooled_descriptor(scan, options)
         record["descriptor"] = np.round(pooled, DESCRIPTOR_DECIMALS).tolist()
     return record
+
+
+def sample_of(description: Mapping[str, Any]) -> np.ndarray:
+    """Return some points of a scan, (K, 3) float64 in file units, from its description."""
+    stored = np.frombuffer(base64.b64decode(description["sample"]), "<f4").reshape(-1, 3)
+    return stored.astype(np.float64) + description["centroid"]
 
 
 def pooled_descriptor(scan: Scan, options: AlignOptions) -> np.ndarray:

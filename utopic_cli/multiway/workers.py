@@ -28,6 +28,10 @@ START_LIMIT_S = 300.0
 """A process that is not ready by then never will be; on a busy machine libraries take their time."""
 
 
+class NotNow(Exception):
+    """A job can't be done, but may be another time."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of one job.
@@ -202,6 +206,8 @@ def _serve(pipe: Connection, make_task: Callable[[], Task], parent: int) -> None
                 answer: _Answer = (task(job), None, False)
             except InputError as error:
                 answer = (None, " ".join(str(error).splitlines()), True)
+            except NotNow as error:
+                answer = (None, " ".join(str(error).splitlines()), False)
             except MemoryError:
                 answer = (None, "ran out of memory", False)
             except Exception as error:
