@@ -18,6 +18,7 @@ from utopic_cli import __version__
 from utopic_cli.commands.align import align
 from utopic_cli.commands.batch import batch
 from utopic_cli.commands.bench import bench
+from utopic_cli.commands.bench_batch import batch_bench
 from utopic_cli.commands.bench_confidence import confidence
 from utopic_cli.commands.bench_curves import mount as mount_curves
 from utopic_cli.commands.bench_speed import speed
@@ -114,6 +115,7 @@ app.command()(info)
 app.command()(train)
 app.command()(calibrate)
 bench.command()(confidence)
+bench.command("batch")(batch_bench)
 mount_curves(bench)
 bench.command()(speed)
 app.add_typer(bench, name="bench")

@@ -104,7 +104,7 @@ def answer_pair(
         matchers: who is asked.
         points: most sampled points per cloud.
     """
-    desk = _Desk(pair, number, protocol, prepare(pair.source, pair.target, points))
+    desk = _Desk(pair, number, protocol, prepare(pair.source, pair.target, points, clean=protocol.cleans))
     answers = [] if pair.shared is None else [desk.floor(pair.shared)]
     for matcher in matchers:
         answers += desk.ask(matcher)

@@ -7,7 +7,7 @@ pairs of a shorter one, and any process can make any pair.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -33,6 +33,53 @@ ATTEMPTS = 30
 SAMPLINGS = ("shared", "independent")
 ROTATIONS = ("uniform", "euler45")
 SCAN_BANDS: tuple[Range, ...] = ((0.5, 0.9), (0.3, 0.5), (0.1, 0.3))
+
+
+class AnyProtocol(Protocol):
+    """What makes pairs and says how answers to them are measured."""
+
+    @property
+    def name(self) -> str:
+        """Of the command."""
+        ...
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """What the table's rows are grouped by."""
+        ...
+
+    @property
+    def cleans(self) -> bool:
+        """Whether scattered points are left out before sampling, as ``utopic align`` does."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """Return the definition, JSON-ready."""
+        ...
+
+    def pair(self, library: ShapeLibrary, seed: int, number: int) -> ScanPair:
+        """Make pair ``number`` of the test set ``seed``."""
+        ...
+
+    def unit(self, pair: ScanPair) -> float:
+        """Length that errors are counted in."""
+        ...
+
+    def centre(self, pair: ScanPair) -> np.ndarray | None:
+        """Source point at which translations are compared; None: the vectors."""
+        ...
+
+    def overlap_radius(self, prepared: PreparedPair) -> float:
+        """Within which nodes overlap, normalised units."""
+        ...
+
+    def inlier_radius(self, prepared: PreparedPair) -> float:
+        """Within which a match is an inlier, normalised units."""
+        ...
+
+    def group(self, number: int) -> str:
+        """Name the group of a pair."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -71,6 +118,11 @@ class CropProtocol:
     def groups(self) -> tuple[str, ...]:
         """What the table's rows are grouped by."""
         return (f"keep {self.keep:g}",)
+
+    @property
+    def cleans(self) -> bool:
+        """Nothing is left out: what is measured is the network and the solve on the pair as it is."""
+        return False
 
     def settings(self) -> dict[str, Any]:
         """Return the definition, JSON-ready."""
@@ -159,6 +211,11 @@ class RangeProtocol:
         """What the table's rows are grouped by."""
         return tuple(f"{low:g}-{high:g}" for low, high in self.bands)
 
+    @property
+    def cleans(self) -> bool:
+        """Nothing is left out: what is measured is the network and the solve on the pair as it is."""
+        return False
+
     def settings(self) -> dict[str, Any]:
         """Return the definition, JSON-ready."""
         return {
@@ -198,6 +255,3 @@ class RangeProtocol:
     def group(self, number: int) -> str:
         """Name the group of a pair."""
         return self.groups[number % len(self.groups)]
-
-
-AnyProtocol = CropProtocol | RangeProtocol

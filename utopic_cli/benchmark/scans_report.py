@@ -21,6 +21,7 @@ from utopic_cli.benchmark.metrics import (
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 SCHEMA_VERSION = 1
 
@@ -112,6 +113,27 @@ class Report:
                 )
         return table
 
+    @property
+    def title(self) -> str:
+        """Protocol and data in one line."""
+        tried = len({attempt.pair for attempt in self.attempts})
+        return (
+            f"scans: {self.settings['directory']} - {tried} pairs x {self.settings['poses']} start poses, "
+            f"seed {self.settings['seed']}"
+        )
+
+    def tables(self) -> list[Table]:
+        """Return the table by overlap band."""
+        return [_by_band(self)]
+
+    def losses(self) -> list[str]:
+        """Say which exceptions ended attempts, and how many: one line for each."""
+        messages = [(attempt.method, attempt.message) for attempt in self.attempts if attempt.message]
+        return [
+            f"{method} failed {messages.count((method, message))} times with {message}"
+            for method, message in sorted(set(messages))
+        ]
+
     def to_json(self) -> str:
         """Return the whole report as indented JSON text."""
         rows = [
@@ -126,14 +148,19 @@ class Report:
 
 def render(report: Report, console: Console) -> None:
     """Print the table by overlap band, and the failures that raised an exception."""
+    for table in report.tables():
+        console.print(table)
+    console.print("Medians of RRE and RTE; means of wall and CPU time.", highlight=False)
+    for line in report.losses():
+        console.print(line, markup=False, highlight=False)
+
+
+def _by_band(report: Report) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    settings = report.settings
-    tried = len({attempt.pair for attempt in report.attempts})
     table = Table(
-        title=f"scans: {escape(settings['directory'])} - {tried} pairs x {settings['poses']} start poses, "
-        f"seed {settings['seed']}",
+        title=escape(report.title),
         caption=f"success: RRE < {MAX_RRE_DEG:g} deg and RTE < {MAX_RTE_SHARE:.0%} of the extent, "
         "RTE at the source's centroid; overlap of the smaller side",
     )
@@ -161,12 +188,7 @@ def render(report: Report, console: Console) -> None:
                 f"{summary.mean_cpu_seconds:.2f}",
             )
         table.add_section()
-    console.print(table)
-    console.print("Medians of RRE and RTE; means of wall and CPU time.", highlight=False)
-    messages = [(a.method, a.message) for a in report.attempts if a.message]
-    for method, message in sorted(set(messages)):
-        count = messages.count((method, message))
-        console.print(f"{method} failed {count} times with {message}", markup=False, highlight=False)
+    return table
 
 
 def _number(value: float | None, form: str) -> str:

@@ -1,6 +1,6 @@
-"""Protocols on synthetic pairs: ``modelnet``, ``modelonet``, ``range-scans``.
+"""Protocols on synthetic pairs: ``modelnet``, ``modelonet``, ``range-scans``, and the curves.
 
-Definitions: ``protocols``. Every method meets the same pairs in the same run, its matches go into
+Definitions: ``protocols``, ``curves``. Every method meets the same pairs in the same run, its matches go into
 the same robust solve, and the answer is measured twice: as solved (no refinement), and after
 refinement at full resolution.
 
@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 from utopic_cli.benchmark.answers import Answer, answer_pair
+from utopic_cli.benchmark.curve_report import CurveReport
 from utopic_cli.benchmark.matcher import Matcher, load_matchers
 from utopic_cli.benchmark.pool import each
 from utopic_cli.benchmark.protocols import AnyProtocol
@@ -75,7 +77,7 @@ def run(
         raise UsageError("pairs and workers must be at least 1, and the seed not negative")
     test, split = held_out(shapes)
     load = partial(load_matchers, tuple(weights), tuple(baselines), seed, device)
-    settings = {
+    settings: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "protocol": protocol.settings(),
         "data": data,
@@ -95,7 +97,8 @@ def run(
             progress(done, of, f"{protocol.name}, pairs of {data}")
 
     answers = each(partial(_task, protocol, test, data, seed, points, load), pairs, workers, tell)
-    return Report(settings, protocol.groups, tuple(answer for some in answers for answer in some))
+    kind = CurveReport if "levels" in settings["protocol"] else Report
+    return kind(settings, protocol.groups, tuple(answer for some in answers for answer in some))
 
 
 def _task(

@@ -70,6 +70,24 @@ class Report:
                     table[method, look] = summarise_uncertainty(pairs, right)
         return table
 
+    def tables(self) -> list[Table]:
+        """Return the tables: poses, the paper's six metrics, matches and overlap, uncertainty."""
+        tables = [_poses(self)]
+        if self.quoted_rows():
+            tables.append(_paper(self))
+        tables.append(_matches(self))
+        if self.uncertainties():
+            tables.append(_uncertainty(self))
+        return tables
+
+    def losses(self) -> list[str]:
+        """Say how often, and why, there was no answer: one line for each reason."""
+        lost = [(answer.method, answer.message) for answer in self.answers if answer.message]
+        return [
+            f"{method}: no answer {lost.count((method, message))} times: {message}"
+            for method, message in sorted(set(lost))
+        ]
+
     def to_json(self) -> str:
         """Return the whole report as JSON text, one answer a line."""
         rows = [
@@ -108,22 +126,16 @@ _FORMS = {
 
 
 def render(report: Report, console: Console) -> None:
-    """Print the tables: poses, the paper's six metrics, matches and overlap."""
-    console.print(_poses(report))
-    if report.quoted_rows():
-        console.print(_paper(report))
-    console.print(_matches(report))
-    if report.uncertainties():
-        console.print(_uncertainty(report))
-    lost = [(a.method, a.message) for a in report.answers if a.message]
-    for method, message in sorted(set(lost)):
-        count = lost.count((method, message))
-        console.print(f"{method}: no answer {count} times: {message}", markup=False, highlight=False)
+    """Print the tables, and why answers are missing where they are."""
+    for table in report.tables():
+        console.print(table)
+    for line in report.losses():
+        console.print(line, markup=False, highlight=False)
 
 
 def _poses(report: Report) -> Table:
     protocol = report.settings["protocol"]
-    table = _table(
+    table = make_table(
         report.title,
         f"recall: both errors are less; lengths in: {protocol['length_unit']}; translations compared "
         f"{protocol['translation_error']}; or symmetric: or the object lies within 2 % of its extent of its "
@@ -146,13 +158,13 @@ def _poses(report: Report) -> Table:
             table.add_section()
         table.add_row(
             group if group != previous else "",
-            _who(method, stage),
+            who(method, stage),
             _number(row.error_r, "{:.3f}"),
             _number(row.error_r_median, "{:.3f}"),
             _number(row.error_t, "{:.4f}"),
             f"{row.fine.share:.1%}",
             f"{row.success.share:.1%}",
-            _share(row.symmetric_success),
+            share_cell(row.symmetric_success),
             _number(row.floor_ratio_r, "{:.2f}"),
             _number(row.floor_ratio_t, "{:.2f}"),
             f"{sum(row.cpu_seconds.values()):.2f}",
@@ -162,14 +174,14 @@ def _poses(report: Report) -> Table:
 
 
 def _paper(report: Report) -> Table:
-    table = _table(
+    table = make_table(
         "The paper's metrics",
         "quoted: from the paper, on ModelNet40 with shared points and its rotations, other pairs than these",
         ("RMSE(R)", "MAE(R)", "RMSE(t)", "MAE(t)", "Error(R)", "Error(t)"),
     )
     for (group, method, stage), row in report.summaries().items():
         cells = [_number(getattr(row, key), _FORMS[key]) for key in METRICS]
-        table.add_row(group, _who(method, stage), *cells)
+        table.add_row(group, who(method, stage), *cells)
     table.add_section()
     for name, *cells in report.quoted_rows():
         table.add_row("", name, *cells)
@@ -177,7 +189,7 @@ def _paper(report: Report) -> Table:
 
 
 def _matches(report: Report) -> Table:
-    table = _table(
+    table = make_table(
         "Matches and overlap at the sampled points",
         "accuracy / precision / recall at 0.5; mutual: accuracy by the paper's labels (mutual nearest "
         "neighbours); final: shown the answer; CPU seconds",
@@ -201,7 +213,7 @@ def _matches(report: Report) -> Table:
             table.add_section()
         table.add_row(
             group if group != previous else "",
-            _who(method, stage),
+            who(method, stage),
             _number(row.hit_rate, "{:.3f}"),
             _number(row.inlier_ratio, "{:.3f}"),
             *_overlap(row.first_overlap),
@@ -231,19 +243,21 @@ def _uncertainty(report: Report) -> Table:
     return table
 
 
-def _table(title: str, caption: str, headings: tuple[str, ...]) -> Table:
+def make_table(title: str, caption: str, headings: tuple[str, ...], first: str = "pairs") -> Table:
+    """Return an empty table whose first columns are ``first`` and the method."""
     from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=escape(title), caption=escape(caption))
-    table.add_column("pairs")
+    table.add_column(first)
     table.add_column("method")
     for heading in headings:
         table.add_column(heading, justify="right")
     return table
 
 
-def _who(method: str, stage: str) -> str:
+def who(method: str, stage: str) -> str:
+    """Name a method at a stage, as markup."""
     from rich.markup import escape
 
     if stage == FLOOR:
@@ -251,7 +265,8 @@ def _who(method: str, stage: str) -> str:
     return escape(f"{method} + refinement" if stage == REFINED else method)
 
 
-def _share(share: Share) -> str:
+def share_cell(share: Share) -> str:
+    """Write a share with its interval, as markup."""
     return f"{share.share:.1%} \\[{100 * share.low:.0f}-{100 * share.high:.0f}]"
 
 

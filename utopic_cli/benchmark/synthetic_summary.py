@@ -68,6 +68,7 @@ class Summary:
 
     Attributes:
         pairs: how many.
+        overlap: mean overlap ratio of their smaller side.
         without_answer: for how many of them no transformation was found.
         error_r: mean Error(R), degrees; None without an answer, as for all errors.
         error_r_median: its median.
@@ -90,6 +91,7 @@ class Summary:
     """
 
     pairs: int
+    overlap: float
     without_answer: int
     error_r: float | None
     error_r_median: float | None
@@ -131,6 +133,7 @@ def summarise(answers: Sequence[Answer], floor: Sequence[Answer] = ()) -> Summar
     steps = dict.fromkeys(step for answer in answers for step in answer.cpu_seconds)
     return Summary(
         pairs=len(answers),
+        overlap=float(np.mean([answer.overlap for answer in answers])),
         without_answer=len(answers) - len(poses),
         error_r=_mean(rotation),
         error_r_median=_median(rotation),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +18,7 @@ from utopic_cli.benchmark.trust_report import (
     number,
     share,
 )
+from utopic_cli.benchmark.web import document, figure, plain_table
 
 COLUMNS = 20
 """Columns of the histogram."""
@@ -51,16 +50,16 @@ def page(report: TrustReport) -> str:
     fills = {
         "title": html.escape(report.title),
         "summary": html.escape(f"{weights}; {hindsight(report)}"),
-        "targets": _table(
+        "targets": plain_table(
             ("", "measured [95 % interval]", "target", "met"),
             [(what, measured, target, met_in_words(met)) for what, measured, target, met in report.targets()],
         ),
         "figures": "\n".join(_figures(report)),
-        "kinds": _table(
+        "kinds": plain_table(
             ("", "trials", "right", "trusted, right", "trusted, wrong", "mean confidence", "CPU, s"),
             [(kind, *row.cells()) for kind, row in report.kinds().items()],
         ),
-        "bins": _table(
+        "bins": plain_table(
             ("confidence", "answers", "mean", "right [95 % interval]"),
             [
                 (
@@ -72,17 +71,12 @@ def page(report: TrustReport) -> str:
                 for one in report.bins
             ],
         ),
-        "mistakes": _table(
+        "mistakes": plain_table(
             ("trial", "kind", "shape", "overlap", "confidence", "off, degrees", "off, extents"), mistakes
         ),
         "settings": html.escape(json.dumps(report.settings, indent=2, allow_nan=False)),
     }
-    pieces = (Path(__file__).parent / "trust_page.html").read_text(encoding="utf-8").split("{{")
-    text = pieces[0]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        text += fills[name] + rest
-    return text
+    return document("trust_page.html", fills)
 
 
 def reliability_diagram(report: TrustReport) -> str:
@@ -159,16 +153,4 @@ def _figures(report: TrustReport) -> list[str]:
             f"{right} right ones upwards, {len(report.right) - right} wrong ones downwards; logarithmic.",
         ),
     )
-    return [
-        f"<figure>{svg}<figcaption><b>{name}.</b> {html.escape(caption)}</figcaption></figure>"
-        for svg, name, caption in figures
-    ]
-
-
-def _table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    if not lines:
-        return "<p>None.</p>"
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
-    body = "\n".join(lines)
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
+    return [figure(svg, name, caption) for svg, name, caption in figures]

@@ -15,11 +15,44 @@ from utopic_cli.config import AlignOptions
 
 if TYPE_CHECKING:
     from utopic_cli.benchmark.protocols import AnyProtocol
+    from utopic_cli.benchmark.result_page import AnyReport
 
 _DEFAULTS = AlignOptions()
 TABLE_WIDTH = 160
 
+JsonOut = Annotated[
+    Path | None, typer.Option("--json", metavar="OUT", help="Every single result, with all settings.")
+]
+HtmlOut = Annotated[
+    Path | None, typer.Option("--html", metavar="OUT", help="One page with the tables and plots.")
+]
+
 bench = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The files a protocol is asked for."""
+
+    json_out: Path | None
+    html_out: Path | None
+    overwrite: bool
+
+    def check(self) -> None:
+        """Refuse, before any work, what can't be written."""
+        from utopic_cli.io.output import check_writable
+
+        check_writable([path for path in (self.json_out, self.html_out) if path is not None], self.overwrite)
+
+    def write(self, report: AnyReport, console: Console) -> None:
+        """Write them, before anything that stdout could spoil."""
+        from utopic_cli.benchmark.result_page import page
+        from utopic_cli.io.output import write_atomically
+
+        for path, text in ((self.json_out, report.to_json), (self.html_out, lambda: page(report))):
+            if path is not None:
+                write_atomically(path, text().encode("utf-8"), overwrite=self.overwrite)
+                console.line(f"wrote {path}")
 
 
 @bench.callback()
@@ -47,9 +80,8 @@ def scans(
     through_cli: Annotated[
         bool, typer.Option("--through-cli", help="Run 'utopic align' on files, a process for each.")
     ] = False,
-    json_out: Annotated[
-        Path | None, typer.Option("--json", metavar="OUT", help="Every single result, with all settings.")
-    ] = None,
+    json_out: JsonOut = None,
+    html_out: HtmlOut = None,
     overwrite: Overwrite = False,
     weights: Weights = _DEFAULTS.weights,
     device: Device = "auto",
@@ -62,10 +94,8 @@ def scans(
 
     Success: under 5 degrees and under 5 % of the extent from the known answer.
     """
-    from utopic_cli.io.output import check_writable, write_atomically
-
-    if json_out is not None:
-        check_writable([json_out], overwrite)
+    outputs = Outputs(json_out, html_out, overwrite)
+    outputs.check()
     console = Console(quiet=quiet)
     with console.progress() as step:
         step("loading libraries")
@@ -76,15 +106,13 @@ def scans(
             pairs=pairs,
             poses=poses,
             seed=seed,
-            baselines=_names(baselines),
+            baselines=names(baselines),
             min_overlap=min_overlap,
             through_cli=through_cli,
             options=AlignOptions(weights=weights, device=device, threads=threads, seed=seed),
             progress=countdown(step),
         )
-    if json_out is not None:  # before anything that stdout could spoil
-        write_atomically(json_out, report.to_json().encode("utf-8"), overwrite=overwrite)
-        console.line(f"wrote {json_out}")
+    outputs.write(report, console)
     from rich.console import Console as RichConsole
 
     render(report, RichConsole())
@@ -116,9 +144,6 @@ Workers = Annotated[
     int,
     typer.Option(min=1, help="Processes, one thread each; their number changes no result."),
 ]
-JsonOut = Annotated[
-    Path | None, typer.Option("--json", metavar="OUT", help="Every single result, with all settings.")
-]
 Sampling = Annotated[
     Literal["shared", "independent"],
     typer.Option(help="Both clouds are crops of one sample (the paper's figures), or of two samples."),
@@ -143,6 +168,7 @@ def modelnet(
     points: Points = _DEFAULTS.points,
     workers: Workers = 1,
     json_out: JsonOut = None,
+    html_out: HtmlOut = None,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Seed = _DEFAULTS.seed,
@@ -150,8 +176,9 @@ def modelnet(
     debug: Debug = False,
 ) -> None:
     """The paper's ModelNet protocol: 1,024 points of a shape, both crops keep 70 %."""
-    asked = _Asked(data, pairs, weights, baselines, points, workers, json_out, overwrite, device, seed, quiet)
-    _measure(asked, lambda: _crops("modelnet", 0.7, sampling, rotations))
+    outputs = Outputs(json_out, html_out, overwrite)
+    asked = Asked(data, pairs, weights, baselines, points, workers, outputs, device, seed, quiet)
+    measure(asked, lambda: _crops("modelnet", 0.7, sampling, rotations))
 
 
 @bench.command()
@@ -165,6 +192,7 @@ def modelonet(
     points: Points = _DEFAULTS.points,
     workers: Workers = 1,
     json_out: JsonOut = None,
+    html_out: HtmlOut = None,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Seed = _DEFAULTS.seed,
@@ -172,8 +200,9 @@ def modelonet(
     debug: Debug = False,
 ) -> None:
     """The paper's ModelLoNet protocol: 1,024 points of a shape, both crops keep 50 %."""
-    asked = _Asked(data, pairs, weights, baselines, points, workers, json_out, overwrite, device, seed, quiet)
-    _measure(asked, lambda: _crops("modelonet", 0.5, sampling, rotations))
+    outputs = Outputs(json_out, html_out, overwrite)
+    asked = Asked(data, pairs, weights, baselines, points, workers, outputs, device, seed, quiet)
+    measure(asked, lambda: _crops("modelonet", 0.5, sampling, rotations))
 
 
 @bench.command("range-scans")
@@ -185,6 +214,7 @@ def range_scans(
     points: Points = _DEFAULTS.points,
     workers: Workers = 1,
     json_out: JsonOut = None,
+    html_out: HtmlOut = None,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Seed = _DEFAULTS.seed,
@@ -192,12 +222,13 @@ def range_scans(
     debug: Debug = False,
 ) -> None:
     """Virtual range scans of whole shapes from two sides, in random poses, by overlap band."""
-    asked = _Asked(data, pairs, weights, baselines, points, workers, json_out, overwrite, device, seed, quiet)
-    _measure(asked, _range_scans)
+    outputs = Outputs(json_out, html_out, overwrite)
+    asked = Asked(data, pairs, weights, baselines, points, workers, outputs, device, seed, quiet)
+    measure(asked, _range_scans)
 
 
 @dataclass(frozen=True)
-class _Asked:
+class Asked:
     """What the protocols on synthetic pairs are asked for alike."""
 
     data: str
@@ -206,19 +237,16 @@ class _Asked:
     baselines: str
     points: int
     workers: int
-    json_out: Path | None
-    overwrite: bool
+    outputs: Outputs
     device: str
     seed: int
     quiet: bool
 
 
-def _measure(asked: _Asked, make_protocol: Callable[[], AnyProtocol]) -> None:
-    from utopic_cli.io.output import check_writable, write_atomically
-
-    if asked.json_out is not None:
-        check_writable([asked.json_out], asked.overwrite)
-    baselines = _names(asked.baselines)
+def measure(asked: Asked, make_protocol: Callable[[], AnyProtocol]) -> None:
+    """Run a protocol on synthetic pairs, write what was asked for, print its tables."""
+    asked.outputs.check()
+    baselines = names(asked.baselines)
     console = Console(quiet=asked.quiet)
     with console.progress() as step:
         step("loading libraries")
@@ -243,9 +271,7 @@ def _measure(asked: _Asked, make_protocol: Callable[[], AnyProtocol]) -> None:
             device=asked.device,
             progress=countdown(step),
         )
-    if asked.json_out is not None:  # before anything that stdout could spoil
-        write_atomically(asked.json_out, report.to_json().encode("utf-8"), overwrite=asked.overwrite)
-        console.line(f"wrote {asked.json_out}")
+    asked.outputs.write(report, console)
     from rich.console import Console as RichConsole
 
     out = RichConsole()
@@ -265,7 +291,8 @@ def _range_scans() -> AnyProtocol:
     return RangeProtocol()
 
 
-def _names(text: str) -> list[str]:
+def names(text: str) -> list[str]:
+    """Take apart a list with commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
