@@ -63,7 +63,9 @@ class Look:
     def sides_in_doubt(self) -> bool:
         """Whether the two scans may have been given normals on opposite sides."""
         sheet = min(self.prepared.source.outwardness, self.prepared.target.outwardness) < CLEAR_OUTWARDNESS
-        return not self.estimate.shared_points and (sheet or self.estimate.score < CLEAR_SCORE)
+        # A low score is what little overlap looks like, too: then the lead over the rivals tells.
+        weak = self.estimate.score < CLEAR_SCORE and self.estimate.margin < UNCLEAR_MARGIN[1]
+        return not self.estimate.shared_points and (sheet or weak)
 
     def joined(self, other: Look) -> Look:
         """Return the better of two looks, with the other one's answer and both's rivals as its rivals.
