@@ -135,7 +135,7 @@ BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 def test_a_browser_draws_every_curve_without_a_complaint(tmp_path):
     records = [record(i, descriptor=5.0 / i, hit_rate=0.1 * i, waiting=0.0) for i in range(1, 9)]
     (tmp_path / "curves.html").write_text(curves_page(records, "run", SETTINGS), encoding="utf-8")
-    flags = "--headless --no-sandbox --disable-gpu --enable-logging=stderr --virtual-time-budget=2000 --run-all-compositor-stages-before-draw"
+    flags = "--headless --no-sandbox --disable-gpu --enable-logging=stderr --virtual-time-budget=2000"
     done = subprocess.run(
         [
             str(BROWSER),
