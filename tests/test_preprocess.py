@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from tests.model.conftest import bumpy_points
+from utopic_cli.frame import find_frame
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.point_cloud import PointCloud
-from utopic_cli.preprocess import PATCHES, carry_to_all, prepare, sample
+from utopic_cli.preprocess import PATCHES, carry_to_all, prepare, sample, sample_pair
 
 
 def half(points: np.ndarray, direction: list[float], keep: float = 0.7) -> np.ndarray:
@@ -171,3 +172,15 @@ def test_many_scattered_points_are_left_out_of_the_sampling():
     few = PointCloud(np.concatenate([ball, air[:60]]))
     pairs = [prepare(few, few, 300, clean=clean) for clean in (False, True)]
     assert np.array_equal(pairs[0].source.points, pairs[1].source.points)  # a few do no harm
+
+
+def test_a_frame_found_once_serves_for_two_samplings():
+    clouds = [PointCloud(np.random.default_rng(seed).uniform(-1, 1, (900, 3))) for seed in (3, 4)]
+    frame = find_frame(*clouds, 300, clean=True)
+    for resampled in (None, 5):
+        rngs = [None if resampled is None else np.random.default_rng(resampled) for _ in range(2)]
+        here = sample_pair(frame, resampled=rngs[0])
+        there = prepare(*clouds, 300, clean=True, resampled=rngs[1])
+        np.testing.assert_array_equal(here.source.points, there.source.points)
+        np.testing.assert_array_equal(here.target.node_index, there.target.node_index)
+        assert here.scale == there.scale and here.spacing == there.spacing

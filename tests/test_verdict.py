@@ -14,7 +14,15 @@ from utopic_cli.geometry import rigid
 from utopic_cli.result import FreeMotion, Observability
 from utopic_cli.verdict import UNCALIBRATED, UNUSUAL, Verdict, judge, motion_in_words, read_calibration
 
-GOOD = {"likeness": 1.0, "conflict": -2.5, "spread": SAME, "support": -0.6, "lead": 0.5, "fixed": -1.0}
+GOOD = {
+    "likeness": 1.0,
+    "conflict": -2.5,
+    "spread": SAME,
+    "support": -0.6,
+    "lead": 0.5,
+    "fixed": -1.0,
+    "stiffness": 0.5,
+}
 FIXED = Observability(np.full(6, 0.3), (), np.eye(6), np.zeros(3), 500)
 
 
@@ -149,6 +157,13 @@ def test_a_motion_left_free_is_never_trusted_however_likely_the_answer() -> None
         found = verdict({"fixed": -4.0}, seen=seen)
         assert not found.trusted and found.confidence == verdict().confidence
         assert found.reasons
+
+
+def test_an_answer_that_a_displaced_source_fits_as_well_is_never_trusted() -> None:
+    found = verdict({"stiffness": 0.0})
+    assert not found.trusted and found.confidence == verdict().confidence
+    assert found.reasons == ("moved by 5% of the scans' size, the source would fit as well",)
+    assert verdict({"stiffness": 0.01}).trusted
 
 
 def test_a_card_without_a_calibration_has_none_and_a_damaged_one_is_an_error() -> None:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from utopic_cli.geometry.nearest import search_threads
 from utopic_cli.model.cloud_input import CloudInput
-from utopic_cli.model.utopic import Utopic
+from utopic_cli.model.utopic import EncodedCloud, Prediction, Utopic
 from utopic_cli.model.weights import choose_device, load_weights
 from utopic_cli.preprocess import PreparedPair, SampledCloud
 
@@ -50,14 +51,52 @@ def load_network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
 
 @contextmanager
 def cpu_threads(count: int) -> Iterator[int]:
-    """Give torch ``count`` CPU threads for a while (0: as it is); yields how many there are."""
+    """Give torch and searches ``count`` CPU threads for a while (0: what torch has); yields how many."""
     before = torch.get_num_threads()
     if count:
         torch.set_num_threads(count)
     try:
-        yield torch.get_num_threads()
+        with search_threads(torch.get_num_threads()):
+            yield torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
+
+
+class Eye:
+    """The network as one registration uses it: what depends on a single cloud is found once."""
+
+    def __init__(self, model: Utopic, seed: int) -> None:
+        """Take the network, and the seed of the overlap samples."""
+        self.model = model
+        self.seed = seed
+        self._seen: list[tuple[SampledCloud, CloudInput, EncodedCloud]] = []
+
+    def __call__(self, prepared: PreparedPair, hypothesis: np.ndarray | None = None) -> NetworkView:
+        """Look at a prepared pair; see ``predict``."""
+        device = next(self.model.parameters()).device
+        with torch.inference_mode():
+            source, encoded_source = self._encode(prepared.source, prepared.spacing)
+            target, encoded_target = self._encode(prepared.target, prepared.spacing)
+            prediction = self.model(
+                source,
+                target,
+                generator=torch.Generator().manual_seed(self.seed),
+                hypothesis=None
+                if hypothesis is None
+                else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
+                encoded=(encoded_source, encoded_target),
+            )
+        return _as_view(prediction, self.model.config.overlap)
+
+    def _encode(self, cloud: SampledCloud, spacing: float) -> tuple[CloudInput, EncodedCloud]:
+        for known, given, encoded in self._seen:
+            if known is cloud:
+                return given, encoded
+        given = to_cloud_input(cloud, spacing, self.model.config.neighbours)
+        given = given.to(next(self.model.parameters()).device)
+        encoded = self.model.encode(given)
+        self._seen.append((cloud, given, encoded))
+        return given, encoded
 
 
 def predict(
@@ -71,19 +110,12 @@ def predict(
         seed: seed of the overlap samples.
         hypothesis: (4, 4) transformation between the normalised clouds to judge the points by.
     """
-    device = next(model.parameters()).device
-    k = model.config.neighbours
-    with torch.inference_mode():
-        prediction = model(
-            to_cloud_input(prepared.source, prepared.spacing, k).to(device),
-            to_cloud_input(prepared.target, prepared.spacing, k).to(device),
-            generator=torch.Generator().manual_seed(seed),
-            hypothesis=None
-            if hypothesis is None
-            else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
-        )
+    return Eye(model, seed)(prepared, hypothesis)
+
+
+def _as_view(prediction: Prediction, overlap: bool) -> NetworkView:
     source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
-    if not model.config.overlap:  # the variant without O weighs all correspondences alike
+    if not overlap:  # the variant without O weighs all correspondences alike
         source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
     return NetworkView(
         _array(prediction.matching_scores[:, :-1, :-1]),

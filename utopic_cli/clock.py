@@ -1,10 +1,12 @@
-"""Seconds per step, and a word to whoever watches when a step starts."""
+"""Seconds per step, and a word to whoever watches or logs when a step starts."""
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 
+_log = logging.getLogger(__name__)
 Progress = Callable[[str], None]
 
 
@@ -22,6 +24,7 @@ class Clock:
         """End the step in hand and start another."""
         self._end()
         self._step, self._since = step, time.perf_counter()
+        _log.info("%s", step)
         if self._progress is not None:
             self._progress(step)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from utopic_cli.errors import InputError
 
@@ -13,6 +13,9 @@ UNCERTAINTY_SCHEMES = ("sampled", "predicted", "none")
 NORMALISATIONS = ("layer", "batch")
 SOLVERS = ("auto", "svd", "consensus")
 DEVICES = ("auto", "cpu", "cuda", "mps")
+
+ColourMapName = Literal["blue-red", "purple-yellow"]
+DEFAULT_COLOUR_MAP: ColourMapName = "blue-red"
 
 ConfigType = TypeVar("ConfigType")
 

@@ -7,8 +7,9 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from utopic_cli.bridge import NetworkView, cpu_threads, load_network, predict
+from utopic_cli.bridge import Eye, NetworkView, cpu_threads, load_network
 from utopic_cli.clock import Clock, Progress
 from utopic_cli.config import SOLVERS, AlignOptions
 from utopic_cli.errors import InputError, UsageError
@@ -18,12 +19,13 @@ from utopic_cli.estimation.problem import working_voxel
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
 from utopic_cli.estimation.verification import measure_fit
+from utopic_cli.frame import find_frame, size_ratio
 from utopic_cli.geometry import rigid
 from utopic_cli.io.records import FormatError
 from utopic_cli.io.scan import check_points, read_scan
 from utopic_cli.look import look, look_both_sides
 from utopic_cli.point_cloud import PointCloud
-from utopic_cli.preprocess import PreparedPair, carry_to_all, prepare, size_ratio
+from utopic_cli.preprocess import PreparedPair, carry_to_all, sample_pair
 from utopic_cli.result import Correspondences, Observability, RegistrationResult
 from utopic_cli.verdict import judge, read_calibration
 
@@ -107,18 +109,15 @@ def _register(
     model, card = load_network(options.weights, options.device)
     calibration = read_calibration(card)
     clock.start("prepare")
-    prepared = prepare(source, target, options.points, clean=True)
+    frame = find_frame(source, target, options.points, clean=True)
+    prepared = sample_pair(frame)
     clock.start("predict and solve")
-
-    def see(pair: PreparedPair) -> NetworkView:
-        return predict(model, pair, options.seed)
-
+    see = Eye(model, options.seed)
     answer = look_both_sides(see, prepared, options.solver, initial)
     spread = SAME
     if options.solver == "auto" and answer.unclear:
         clock.start("sample, predict and solve anew")
-        rng = np.random.default_rng(options.seed)
-        again = prepare(source, target, options.points, clean=True, resampled=rng)
+        again = sample_pair(frame, resampled=np.random.default_rng(options.seed))
         if answer.inside_out:
             again = replace(again, source=again.source.turned_inside_out())
         try:
@@ -130,16 +129,20 @@ def _register(
             answer = answer.joined(other)
     prepared, view, estimate = answer.prepared, answer.view, answer.estimate
     transformation = prepared.denormalise(estimate.T_target_source)
+    trees = cKDTree(source.points), cKDTree(target.points)
     if options.refine:
         clock.start("refine")
-        transformation = refine(source, target, transformation).T_target_source
+        transformation = refine(source, target, transformation, trees=trees).T_target_source
     normalised = prepared.normalise(transformation)
     if model.config.hypothesis and options.solver != "svd":
         clock.start("look again")
-        view = predict(model, prepared, options.seed, normalised)
+        view = see(prepared, normalised)
     clock.start("measure")
-    threshold = COUNTERPART_REACH * max(point_spacing(source.points), point_spacing(target.points))
-    fit = measure_fit(source, target, transformation, threshold, estimate.support)
+    spacings = [
+        point_spacing(cloud.points, tree) for cloud, tree in zip((source, target), trees, strict=True)
+    ]
+    threshold = COUNTERPART_REACH * max(spacings)
+    fit = measure_fit(source, target, transformation, threshold, estimate.support, trees=trees)
     voxel = working_voxel(prepared.source.dense, prepared.target.dense, prepared.spacing)
     surfaces = make_surface(prepared.source.dense, voxel), make_surface(prepared.target.dense, voxel)
     observability = _observe(prepared, *surfaces, normalised)
@@ -153,13 +156,13 @@ def _register(
     )
     clock.start("carry to all points")
     source_all = _carry(
-        (source.points - prepared.source_centre) / prepared.scale,
+        frame.points[0],
         prepared.source.points,
         view.source_overlap,
         view.source_uncertainty,
     )
     target_all = _carry(
-        (target.points - prepared.target_centre) / prepared.scale,
+        frame.points[1],
         prepared.target.points,
         view.target_overlap,
         view.target_uncertainty,

@@ -1,9 +1,9 @@
 """From two raw clouds to what the network sees, and back: one frame, one scale, one density.
 
 Both clouds of a pair are centred, divided by one common scale, and sampled with one common
-node spacing h; the dense scan around each sampled point is kept as its local geometry. No
-unit, radius or voxel size is asked for: h follows from the clouds. Training and inference
-share this file, so what the network is shown never differs between them.
+node spacing h (see ``frame``); the dense scan around each sampled point is kept as its local
+geometry. Training and inference share this file, so what the network is shown never differs
+between them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.errors import InputError
+from utopic_cli.frame import DENSE_RATIO, FEWEST_DENSE_POINTS, Frame, find_frame
+from utopic_cli.geometry.nearest import nearest
 from utopic_cli.geometry.normals import estimate_normals, orient_normals, orient_towards
-from utopic_cli.geometry.outliers import astray, scattered
 from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.geometry.voxel import cell_means, voxel_downsample, voxel_index
 from utopic_cli.point_cloud import PointCloud
@@ -25,18 +25,6 @@ NEIGHBOURS = 20
 
 PATCHES = ((1.8, 32), (3.6, 24), (7.2, 24))
 """Radius in node spacings and number of points of the three local-geometry patches."""
-
-DENSE_RATIO = 2.2
-"""Node spacing over the voxel size of the dense cloud."""
-
-FEWEST_DENSE_POINTS = 30
-"""A scan that shrinks to fewer points than this at the pair's common spacing can't be aligned."""
-
-MOST_SCATTERED = 0.02
-"""Share of scattered points that does no harm: the network has seen as many in training."""
-
-MOST_POINTS = 400_000
-"""A larger cloud is thinned evenly to about this many points before anything else."""
 
 
 @dataclass(frozen=True)
@@ -153,29 +141,37 @@ def prepare(
         InputError: one scan is so much smaller than the other that nothing of it is left at a
             spacing that suits both.
     """
-    kept = [~astray(cloud.points) for cloud in (source, target)]
-    centres = [cloud.points[keep].mean(axis=0) for cloud, keep in zip((source, target), kept, strict=True)]
-    centred = [cloud.points - centre for cloud, centre in zip((source, target), centres, strict=True)]
-    parts = [part[keep] for part, keep in zip(centred, kept, strict=True)]
-    scale = max(float(np.quantile(np.linalg.norm(part, axis=1), 0.99)) for part in parts)
-    thinned = [_thin(part / scale) for part in parts]
-    if clean:
-        thinned = [_without_scattered(part) for part in thinned]
-    spacing = _common_spacing(thinned, points)
+    frame = find_frame(source, target, points, clean=clean)
+    return sample_pair(
+        frame, source_viewpoint=source_viewpoint, target_viewpoint=target_viewpoint, resampled=resampled
+    )
+
+
+def sample_pair(
+    frame: Frame,
+    *,
+    source_viewpoint: np.ndarray | None = None,
+    target_viewpoint: np.ndarray | None = None,
+    resampled: np.random.Generator | None = None,
+) -> PreparedPair:
+    """Sample both scans of a pair as often as need be; arguments are those of ``prepare``."""
+    parts, most = frame.parts, frame.most
     viewpoints = [
-        None if view is None else (view - centre) / scale
-        for view, centre in zip((source_viewpoint, target_viewpoint), centres, strict=True)
+        None if view is None else (view - centre) / frame.scale
+        for view, centre in zip((source_viewpoint, target_viewpoint), frame.centres, strict=True)
     ]
-    _check_sizes(thinned, spacing)
-    grids = [None if resampled is None else random_rotation(resampled) for _ in thinned]
+    grids = [None if resampled is None else random_rotation(resampled) for _ in parts]
     if resampled is not None:
-        thinned = [_nine_in_ten(part, points, resampled) for part in thinned]
+        parts = tuple(_nine_in_ten(part, most, resampled) for part in parts)
     sampled = [
-        sample(part, spacing, points, viewpoint=view, grid=grid)
-        for part, view, grid in zip(thinned, viewpoints, grids, strict=True)
+        sample(part, frame.spacing, most, viewpoint=view, grid=grid)
+        for part, view, grid in zip(parts, viewpoints, grids, strict=True)
     ]
-    indexed = [_with_node_index(cloud, part / scale) for cloud, part in zip(sampled, centred, strict=True)]
-    return PreparedPair(indexed[0], indexed[1], centres[0], centres[1], scale, spacing)
+    source, target = (
+        replace(cloud, node_index=tree.query(cloud.points)[1])
+        for cloud, tree in zip(sampled, frame.trees, strict=True)
+    )
+    return PreparedPair(source, target, *frame.centres, frame.scale, frame.spacing)
 
 
 def sample(
@@ -237,11 +233,6 @@ def sample(
     )
 
 
-def _without_scattered(points: np.ndarray) -> np.ndarray:
-    alone = scattered(points)
-    return points[~alone] if alone.mean() > MOST_SCATTERED else points
-
-
 def _nine_in_ten(points: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
     if len(points) > most:
         return points
@@ -260,80 +251,10 @@ def carry_to_all(points: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> n
         (P, C) float32.
     """
     k = min(3, len(nodes))
-    distance, index = cKDTree(nodes).query(points, k=k, workers=-1)
+    distance, index = nearest(cKDTree(nodes), points, range(1, k + 1))
     weight = 1.0 / (distance.reshape(len(points), k) ** 2 + 1e-12)
     weight /= weight.sum(axis=1, keepdims=True)
     return np.einsum("pk,pkc->pc", weight, values[index.reshape(len(points), k)]).astype(np.float32)
-
-
-def _thin(points: np.ndarray) -> np.ndarray:
-    """Thin a very large cloud by a fine grid, so that memory and time stay bounded."""
-    if len(points) <= MOST_POINTS:
-        return points
-    size = 2.0 / 400.0
-    for _ in range(8):
-        thinned, _ = voxel_downsample(points, size)
-        if len(thinned) <= MOST_POINTS:
-            return thinned
-        size *= 1.4
-    return thinned
-
-
-def _common_spacing(clouds: list[np.ndarray], most: int) -> float:
-    """Find one node spacing for both clouds: the finest the denser-covered one allows.
-
-    A cloud with more than ``most`` points gets the voxel size that leaves about ``most``
-    nodes; a sparser cloud has the spacing of its own points. The coarser of the two holds.
-    """
-    return max(
-        _voxel_size_for(points, most) if len(points) > most else _own_spacing(points) for points in clouds
-    )
-
-
-def _check_sizes(clouds: list[np.ndarray], spacing: float) -> None:
-    """Refuse a pair whose smaller scan is but a dot beside the larger one."""
-    if min(voxel_index(points, spacing / DENSE_RATIO)[1] for points in clouds) >= FEWEST_DENSE_POINTS:
-        return
-    ratio = size_ratio(*clouds)
-    raise InputError(
-        f"the scans' sizes differ by a factor of about {ratio:.3g}: "
-        f"bring both to the same unit{units_in_words(ratio)}"
-    )
-
-
-def size_ratio(source: np.ndarray, target: np.ndarray) -> float:
-    """Return the extent of the larger cloud over that of the smaller one, points astray left out."""
-    extents = [float(np.linalg.norm(np.ptp(points[~astray(points)], axis=0))) for points in (source, target)]
-    return max(extents) / max(min(extents), 1e-300)
-
-
-def units_in_words(ratio: float) -> str:
-    """Guess which units were mixed up, in parentheses; empty if the ratio is that of none."""
-    for factor, units in ((1000.0, "millimetres against metres"), (25.4, "millimetres against inches")):
-        if factor / 2.0 < ratio < factor * 2.0:
-            return f" ({units}?)"
-    return ""
-
-
-def _voxel_size_for(points: np.ndarray, most: int) -> float:
-    """Return the voxel size that leaves at most, and nearly, ``most`` cells."""
-    low, high = 1e-4, 2.0
-    for _ in range(14):
-        size = float(np.sqrt(low * high))
-        if voxel_index(points, size)[1] > most:
-            low = size
-        else:
-            high = size
-        if high / low < 1.015:
-            break
-    return max(high, _own_spacing(points) if len(points) < 4 * most else 0.0)
-
-
-def _own_spacing(points: np.ndarray) -> float:
-    """Return the voxel size that would give a cloud's own density: 0.75 of the 8th neighbour's distance."""
-    points = np.unique(points, axis=0)  # merged files hold places many times
-    k = min(9, len(points))
-    return float(0.75 * np.median(cKDTree(points).query(points, k=k)[0][:, -1]))
 
 
 def _cell_normals(normals: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
@@ -365,8 +286,3 @@ def _patch(
 def _normals_of(cloud: PointCloud) -> np.ndarray:
     assert cloud.normals is not None  # every dense cloud is made with them
     return cloud.normals
-
-
-def _with_node_index(cloud: SampledCloud, points: np.ndarray) -> SampledCloud:
-    """Fill in which original point is nearest to each node."""
-    return replace(cloud, node_index=cKDTree(points).query(cloud.points)[1])

@@ -12,7 +12,7 @@ from utopic_cli.errors import InputError
 from utopic_cli.estimation.candidates import LEAST_SUPPORT
 from utopic_cli.estimation.confidence import Calibration
 from utopic_cli.estimation.evidence import Evidence
-from utopic_cli.estimation.observability import FREE
+from utopic_cli.estimation.observability import DISPLACED, FREE
 from utopic_cli.geometry.rigid import relative_rotation_error_deg
 from utopic_cli.result import FreeMotion, Observability
 
@@ -34,6 +34,9 @@ CONFLICT = -1.5
 MOST_CONFLICT = -1.0
 """With more of it an answer is not trusted, whatever else speaks for it: one right answer in a hundred has
 as much, and nothing else tells a body from its mirror image where most of it is symmetric."""
+
+LIMP = 0.0
+"""A stiffness of no more: displaced by what a right answer may be off by, the source fits as well."""
 
 FEW_EXPLAINED = -1.2
 """A log10 of the share of matches explained below this is what wrong answers reach."""
@@ -86,11 +89,12 @@ def read_calibration(card: dict[str, Any]) -> Calibration | None:
 def ruled_out(signals: dict[str, float]) -> bool:
     """Tell whether an answer is not to be trusted, however likely it is.
 
-    Along a motion that the surfaces leave free it is right by luck alone; scans that contradict
-    each other can't both be right, nor can two answers to two samplings of the same scans.
+    Along a motion that the surfaces leave free, or that they do not notice, it is right by luck alone;
+    scans that contradict each other can't both be right, nor can two answers to two samplings of the
+    same scans.
     """
-    undetermined, contradicted = signals["fixed"] < np.log10(FREE), signals["conflict"] > MOST_CONFLICT
-    return bool(undetermined or contradicted or signals["spread"] > APART)
+    undetermined = signals["fixed"] < np.log10(FREE) or signals["stiffness"] <= LIMP
+    return bool(undetermined or signals["conflict"] > MOST_CONFLICT or signals["spread"] > APART)
 
 
 def judge(
@@ -161,6 +165,8 @@ def _doubts(
     elif observability.free:
         said = " and ".join(motion_in_words(motion) for motion in observability.free)
         doubts.append(f"symmetric: {said} {'is' if len(observability.free) == 1 else 'are'} not determined")
+    elif signals["stiffness"] <= LIMP:
+        doubts.append(f"moved by {DISPLACED:.0%} of the scans' size, the source would fit as well")
     if rivals:
         count = "two poses fit" if len(rivals) == 1 else f"{len(rivals) + 1} poses fit"
         angle = max(relative_rotation_error_deg(rival, transformation) for rival in rivals)

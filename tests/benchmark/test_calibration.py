@@ -11,7 +11,7 @@ from utopic_cli.benchmark import calibration
 from utopic_cli.benchmark.calibration import MOST_RISK, Outcome, calibrate, fit, outcome_of
 from utopic_cli.errors import InputError, UsageError
 
-FINE = {"fixed": -1.0, "conflict": -2.5, "spread": -3.0}
+FINE = {"fixed": -1.0, "conflict": -2.5, "spread": -3.0, "stiffness": 0.5}
 
 
 def outcomes(count: int, seed: int, steepness: float = 6.0) -> list[Outcome]:
@@ -52,7 +52,7 @@ def test_the_threshold_holds_on_other_outcomes() -> None:
 
 def test_what_is_ruled_out_anyway_does_not_raise_the_threshold() -> None:
     def accepted(fixed: float) -> float:
-        loud = {"margin": 1.0, "noise": 0.0, "fixed": fixed, "conflict": -2.5, "spread": -3.0}
+        loud = {"margin": 1.0, "noise": 0.0, "fixed": fixed, "conflict": -2.5, "spread": -3.0, "stiffness": 0.5}
         wrong = [Outcome(3000 + i, "symmetric", False, loud) for i in range(30)]
         return fit(outcomes(3000, 4, 12.0) + wrong, {}).description["out_of_fold"]["right_accepted"]
 

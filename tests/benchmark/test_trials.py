@@ -122,6 +122,17 @@ def test_disjoint_scans_share_no_surface(shapes, monkeypatch):
         assert cKDTree(pair.target.points).query(one.target.points)[0].max() == 0.0  # still the same scan
 
 
+def test_symmetric_shapes_are_a_kind_of_their_own(shapes):
+    rng = np.random.default_rng(5)
+    lumpy, prism = shapes.mesh(0), SYMMETRIC["hexagonal prism"][0](rng)
+    mixed = pack([lumpy, prism], ["lumpy", "prism"], ["val"] * 2, ["one"] * 2)
+    settings = replace(trials.trial_scans.SETTINGS, warp_probability=0.0, stretch_probability=0.0)
+    for kind, expected in (("sparse", "lumpy"), ("symmetric-shape", "prism")):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(trials.trial_scans, "SETTINGS", settings)
+            assert [trial(mixed, 4, number, (kind,)).shape for number in range(4)] == [expected] * 4, kind
+
+
 def test_different_objects_come_from_different_collections(made, shapes):
     for one in made["different"]:
         first, second = one.shape.split(" | ")

@@ -81,3 +81,24 @@ def test_bad_arguments_are_refused() -> None:
         consensus_hypotheses(np.eye(3)[:2], np.eye(3)[:2], np.ones(2), 0.1)
     with pytest.raises(ValueError, match="tolerance"):
         consensus_hypotheses(np.eye(3), np.eye(3), np.ones(3), 0.0)
+
+
+def test_distinct_keeps_what_no_better_one_kept_stands_for() -> None:
+    rng = np.random.default_rng(8)
+    transformations = np.stack(
+        [
+            rigid.rigid(rigid.rotation_from_vector(rng.uniform(-0.3, 0.3, 3)), rng.uniform(-0.2, 0.2, 3))
+            for _ in range(60)
+        ]
+    )
+    centre = np.array([0.5, -1.0, 2.0])
+    kept: list[int] = []
+    for i, T in enumerate(transformations):
+        if not any(
+            np.linalg.norm(rigid.apply(T, centre) - rigid.apply(transformations[j], centre)) < 0.5
+            and rigid.relative_rotation_error_deg(T, transformations[j]) < 12.0
+            for j in kept
+        ):
+            kept.append(i)
+    assert 5 < len(kept) < 55
+    assert distinct(transformations, centre, 0.5, 12.0).tolist() == kept

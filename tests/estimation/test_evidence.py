@@ -111,7 +111,7 @@ def test_every_signal_of_a_right_answer_is_finite_and_good(answered: tuple[Estim
     assert 10.0**evidence.support == pytest.approx(estimate.support)
     assert evidence.conflict == pytest.approx(np.log10(NO_CONFLICT)) and evidence.completeness == 0.0
     assert evidence.seen_contrast > 0.2 and evidence.uncertainty == pytest.approx(0.02)
-    assert evidence.fixed > -2.5 and evidence.spread == SAME
+    assert evidence.fixed > -2.5 and evidence.stiffness > 0.1 and evidence.spread == SAME
 
 
 def test_a_rival_as_good_as_the_answer_takes_the_lead_away(
@@ -155,3 +155,4 @@ def test_where_nothing_meets_the_signals_are_finite_all_the_same(
     evidence = collect_evidence(source, target, far, answered[0], seen, fit, None, 0.0)
     assert all(np.isfinite(value) for value in evidence.as_dict().values())
     assert evidence.seen_overlap == 0.0 and evidence.fixed == -5.0 and evidence.extent == 0.0
+    assert evidence.stiffness == 0.0

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import lumpy_surface
-from utopic_cli.estimation.observability import observe
+from utopic_cli.estimation.meeting import meet, self_agreement
+from utopic_cli.estimation.observability import observe, stiffness
 from utopic_cli.estimation.surface import Surface, make_surface
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.normals import estimate_normals, orient_towards
@@ -119,3 +120,33 @@ def test_surfaces_that_do_not_meet_have_no_answer():
     cloud = make_surface(lumpy_surface(3000, 0.0), 0.03)
     with pytest.raises(ValueError, match="only 0 points overlap"):
         observe(cloud, cloud, rigid.rigid(np.eye(3), np.array([50.0, 0, 0])))
+
+
+def stiffness_of(shape, **how) -> float:  # type: ignore[no-untyped-def]
+    source, target = (
+        surface(shape(np.random.default_rng(seed), **how), np.array([9.0, 2.0, 9.0])) for seed in (1, 2)
+    )
+    alike = self_agreement(source, target)
+    return stiffness(source, target, np.eye(4), meet(source, target, np.eye(4), alike).likeness, alike)
+
+
+@pytest.mark.parametrize("shape", [plane, cylinder])
+def test_a_surface_displaced_along_itself_fits_as_well(shape) -> None:  # type: ignore[no-untyped-def]
+    assert stiffness_of(shape) < 0.005
+
+
+def profile(rng: np.random.Generator, notch: float = 0.0) -> np.ndarray:
+    """A wavy bar along y; a notch across it, ``notch`` deep, ends its freedom to slide."""
+    x, y = rng.uniform(-1, 1, (2, 60_000))
+    z = 0.4 * np.sin(3 * x) - notch * (np.abs(y) < 0.15)
+    return np.stack([x, y, z], axis=1) + rng.normal(0, 0.1 * VOXEL, (60_000, 3))
+
+
+def test_a_bar_slides_along_itself_and_a_notch_stops_it() -> None:
+    assert stiffness_of(profile) < 0.005
+    assert stiffness_of(profile, notch=0.1) > 0.1
+
+
+def test_where_nothing_overlaps_nothing_is_stiff() -> None:
+    one = surface(plane(np.random.default_rng(1)), np.array([0.0, 0.0, 9.0]))
+    assert stiffness(one, one, rigid.rigid(np.eye(3), np.array([50.0, 0.0, 0.0])), 0.0, 1.0) == 0.0

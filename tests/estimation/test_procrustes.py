@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from utopic_cli.estimation.procrustes import procrustes_batch, weighted_procrustes
+from utopic_cli.estimation.procrustes import procrustes_batch, procrustes_shared, weighted_procrustes
 from utopic_cli.geometry import rigid
 
 
@@ -81,3 +81,16 @@ def test_batch_equals_one_by_one() -> None:
     for i in range(6):
         assert np.allclose(together[i], weighted_procrustes(source[i], target[i], weights[i]), atol=1e-12)
     assert ((spread > 0) & (spread <= 1)).all()
+
+
+def test_shared_pairs_are_solved_as_single_problems_are() -> None:
+    rng = np.random.default_rng(7)
+    source = rng.standard_normal((40, 3)) + 20.0
+    target = rng.standard_normal((40, 3)) - [5.0, 300.0, 0.0]
+    weights = rng.uniform(0, 1, (6, 40)) * (rng.random((6, 40)) < 0.4)
+    together, spread = procrustes_shared(source, target, weights)
+    one_by_one, expected = procrustes_batch(
+        np.broadcast_to(source, (6, 40, 3)), np.broadcast_to(target, (6, 40, 3)), weights
+    )
+    np.testing.assert_allclose(together, one_by_one, atol=1e-9)
+    np.testing.assert_allclose(spread, expected, atol=1e-9)

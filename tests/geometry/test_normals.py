@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.normals import estimate_normals, orient_normals, orient_towards
@@ -61,3 +62,22 @@ def test_orient_towards_faces_the_viewpoint() -> None:
     facing = orient_towards(points, points, viewpoint)
     assert (np.einsum("nd,nd->n", facing, viewpoint - points) >= 0).all()
     assert np.abs(np.abs(facing) - np.abs(points)).max() == 0.0
+
+
+def test_normals_of_some_points_are_those_among_all() -> None:
+    points = sphere() + 0.02 * np.random.default_rng(3).standard_normal((1500, 3))
+    rows = np.array([700, 3, 1400])
+    some = estimate_normals(points, 16, 0.2, tree=cKDTree(points), at=rows)
+    np.testing.assert_array_equal(some, estimate_normals(points, 16, 0.2)[rows])
+    assert estimate_normals(points, 16, at=rows[:0]).shape == (0, 3)
+
+
+def test_a_normal_is_the_least_axis_of_the_neighbours_within_the_radius() -> None:
+    points = np.random.default_rng(4).standard_normal((400, 3))
+    normals = estimate_normals(points, 12, 0.6)
+    distance = np.linalg.norm(points[:, None] - points, axis=2)
+    for i in (0, 17, 399):
+        nearest = np.argsort(distance[i])[:12]
+        near = points[nearest[(distance[i, nearest] <= 0.6) | (np.arange(12) < 3)]]
+        least = np.linalg.eigh(np.cov(near.T))[1][:, 0]
+        assert abs(least @ normals[i]) == pytest.approx(1.0, abs=1e-9)

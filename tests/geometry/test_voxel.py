@@ -29,3 +29,14 @@ def test_a_huge_cell_holds_everything() -> None:
     owner, count = voxel_index(points, 1e6)
     assert count == 1 and not owner.any()
     assert cell_means(points, owner, count)[0] == pytest.approx(points.mean(axis=0))
+
+
+def test_cells_are_numbered_alike_in_small_and_large_grids(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(5).uniform(-1, 1, (500, 3))
+    for size in (0.1, 0.3):
+        numbered = voxel_index(points, size)
+        monkeypatch.setattr("utopic_cli.geometry.voxel.FEW", 0)  # by sorting
+        by_sorting = voxel_index(points, size)
+        monkeypatch.undo()
+        np.testing.assert_array_equal(numbered[0], by_sorting[0])
+        assert numbered[1] == by_sorting[1] == numbered[0].max() + 1

@@ -147,3 +147,16 @@ def test_edge_invariants_of_a_plane_and_a_step():
     )
     raised = edge_invariants(torch.tensor([0.0, 0.0, 0.5]), up, up)
     assert raised[1] == 0.5 and raised[8] == 0.25
+
+
+def test_attention_without_gradients_equals_attention_with_them():
+    torch.manual_seed(2)
+    layer = AttentionLayer(8, 2, 3)
+    torch.nn.init.normal_(layer.relation)
+    features, embedding = torch.randn(2, 7, 8), torch.randn(2, 3, 7, 7)
+    valid = torch.arange(7) < torch.tensor([[7], [4]])
+    plain = layer(features, features, embedding, valid)
+    assert plain.requires_grad
+    with torch.no_grad():
+        fused = layer(features, features, embedding, valid)
+    torch.testing.assert_close(fused, plain.detach(), atol=1e-6, rtol=1e-5)

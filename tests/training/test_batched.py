@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from utopic_cli.frame import DENSE_RATIO, _common_spacing
 from utopic_cli.geometry.normals import orient_normals
-from utopic_cli.preprocess import DENSE_RATIO, PATCHES, _common_spacing, sample
+from utopic_cli.preprocess import PATCHES, sample
 from utopic_cli.synthesis import scanner as one_scanner
 from utopic_cli.synthesis.pairs import random_pair
 from utopic_cli.synthesis.scan_pair import DegeneratePair

@@ -29,8 +29,8 @@ from utopic_cli.verdict import ruled_out
 MOST_RISK = 0.01
 """Of the answers that are trusted, at most this share is to be wrong, measured out of fold."""
 
-LEAST_CONFIDENCE = 0.9
-"""Nor is a single answer trusted that is more likely wrong than once in ten times."""
+LEAST_CONFIDENCE = 0.8
+"""Nor is a single answer trusted that is more likely wrong than once in five times."""
 
 FOLDS = 10
 RIDGE = 3.0

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.benchmark.baselines import load_open3d
+from utopic_cli.benchmark.open3d_methods import load_open3d
 from utopic_cli.bridge import NetworkView
-from utopic_cli.preprocess import DENSE_RATIO, PreparedPair, SampledCloud
+from utopic_cli.frame import DENSE_RATIO
+from utopic_cli.preprocess import PreparedPair, SampledCloud
 
 RADII = (5.0, 9.0)  # in voxels
 MOST_NEIGHBOURS = 200

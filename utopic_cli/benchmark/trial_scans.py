@@ -38,6 +38,11 @@ CLEARLY_APART = 0.01
 points of the one are on average farther from the other than this share of the extent."""
 
 
+SYMMETRIC = 0.006
+"""A shape counts as symmetric if a turn lays it on itself to within this (see ``CLEARLY_APART``): as near
+as a scan's noise. Opposite sides of it look like one side seen twice: its trials are a kind of their own."""
+
+
 def scans(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
     """Virtual range scans from two sides, in the overlap bands .1-.3, .3-.5 and .5-.9 equally often."""
     return with_answer("scans", _in_band(shapes, rng, BANDS[rng.integers(3)], SETTINGS))
@@ -52,7 +57,9 @@ def several_views(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
 def patch(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
     """Two overlapping dense patches of a whole surface, all sides of it."""
     shape = shapes.draw(rng)
-    return with_answer("patch", patch_pair(shapes.mesh(shape), rng, SETTINGS), str(shapes.names[shape]))
+    pair = patch_pair(shapes.mesh(shape), rng, SETTINGS, whole=True)
+    _check_symmetry(pair, rng)
+    return with_answer("patch", pair, str(shapes.names[shape]))
 
 
 def sparse(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
@@ -65,7 +72,9 @@ def sparse(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
         keep=rng.uniform(*SETTINGS.surface_keep),
         count=int(np.exp(rng.uniform(*np.log(SETTINGS.surface_points)))),
         noise=rng.uniform(*SETTINGS.surface_noise),
+        whole=True,
     )
+    _check_symmetry(pair, rng)
     if pair.smaller_overlap < SETTINGS.minimum_overlap:
         raise DegeneratePair(f"overlap {pair.smaller_overlap:.2f}")
     return with_answer("sparse", pair, str(shapes.names[shape]))
@@ -75,6 +84,13 @@ def little(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
     """Range scans with an overlap of .02 to .1: an answer exists, hardly anybody can find it."""
     settings = replace(SETTINGS, minimum_overlap=LITTLE[0], view_angle=(90.0, 175.0))
     return with_answer("little", _in_band(shapes, rng, LITTLE, settings))
+
+
+def symmetric_shape(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
+    """Range scans as of the kind ``scans``, of shapes that a turn lays on themselves, or all but so."""
+    return with_answer(
+        "symmetric-shape", _in_band(shapes, rng, BANDS[rng.integers(3)], SETTINGS, symmetric=True)
+    )
 
 
 def disjoint(shapes: ShapeLibrary, rng: np.random.Generator) -> Trial:
@@ -228,8 +244,28 @@ def _laid_on(
     return turn, shift
 
 
-def _in_band(shapes: ShapeLibrary, rng: np.random.Generator, band: Range, settings: PairSettings) -> ScanPair:
-    return evaluation_pair(shapes, int(rng.integers(2**31)), 0, (band,), settings)
+def _in_band(
+    shapes: ShapeLibrary,
+    rng: np.random.Generator,
+    band: Range,
+    settings: PairSettings,
+    *,
+    symmetric: bool = False,
+) -> ScanPair:
+    pair = evaluation_pair(shapes, int(rng.integers(2**31)), 0, (band,), settings, whole=True)
+    _check_symmetry(pair, rng, symmetric)
+    return pair
+
+
+def _check_symmetry(pair: ScanPair, rng: np.random.Generator, symmetric: bool = False) -> None:
+    """Make sure that the object, sampled whole, is symmetric or is not.
+
+    Raises:
+        DegeneratePair: it is the other way round.
+    """
+    assert pair.object_points is not None  # asked for
+    if (turned_distance(pair.object_points, rng) < SYMMETRIC) != symmetric:
+        raise DegeneratePair(f"the shape is {'not ' if symmetric else ''}all but itself when turned")
 
 
 def _clouds(pair: ScanPair, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,14 +24,15 @@ __all__ = ["KINDS", "Trial", "bench_half", "calibration_half", "trial"]
 Maker = Callable[[ShapeLibrary, np.random.Generator], Trial]
 
 MAKERS: dict[str, tuple[float, Maker]] = {
-    "scans": (0.30, trial_scans.scans),
+    "scans": (0.28, trial_scans.scans),
     "several-views": (0.05, trial_scans.several_views),
     "patch": (0.06, trial_scans.patch),
     "sparse": (0.07, trial_scans.sparse),
-    "near-symmetric": (0.09, trial_solids.near_symmetric),
+    "symmetric-shape": (0.04, trial_scans.symmetric_shape),
+    "near-symmetric": (0.08, trial_solids.near_symmetric),
     "room": (0.07, trial_solids.room),
     "little": (0.07, trial_scans.little),
-    "disjoint": (0.10, trial_scans.disjoint),
+    "disjoint": (0.09, trial_scans.disjoint),
     "different": (0.07, trial_scans.different),
     "mirrored": (0.05, trial_scans.mirrored),
     "symmetric": (0.07, trial_solids.symmetric),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from utopic_cli.estimation.consensus import Hypothesis, distinct
-from utopic_cli.estimation.meeting import meet
+from utopic_cli.estimation.meeting import meet, self_agreement
 from utopic_cli.estimation.partners import (
     BEYOND_CHANCE,
     approach_partners,
@@ -79,14 +79,32 @@ def screen(
     ]
 
 
+class CoarseRefinement:
+    """Coarse ICP between two surfaces from any transformation, from each but once."""
+
+    def __init__(self, source: Surface, target: Surface) -> None:
+        """Remember the surfaces."""
+        self.source, self.target = source, target
+        self._known: dict[bytes, np.ndarray] = {}
+
+    def __call__(self, transformations: np.ndarray) -> np.ndarray:
+        """Refine (H, 4, 4) transformations."""
+        new = {T.tobytes(): T for T in transformations if T.tobytes() not in self._known}
+        if new:
+            refined = refine_coarse(self.source, self.target, np.stack(list(new.values())), COARSE)
+            self._known.update(zip(new, refined, strict=True))
+        return np.stack([self._known[T.tobytes()] for T in transformations])
+
+
 def refine_candidates(
-    problem: Problem, screened: list[Hypothesis], source: Surface, target: Surface, *, refine: bool
+    problem: Problem, screened: list[Hypothesis], refinement: CoarseRefinement, *, refine: bool
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Refine and verify the best of the screened hypotheses.
+    """Refine (if ``refine``) and verify the best of the screened hypotheses.
 
     Returns:
         The distinct candidates, best first, and those of them whose points have partners.
     """
+    source, target = refinement.source, refinement.target
     screened = sorted(screened, key=lambda hypothesis: -hypothesis.score)
     transformations = np.stack([hypothesis.T_target_source for hypothesis in screened])
     centre = source.points.mean(axis=0)
@@ -95,7 +113,7 @@ def refine_candidates(
     kept = distinct(transformations, centre, apart / 4, 2.5)[:most]
     transformations, origins = transformations[kept], np.array([screened[i].origin for i in kept])
     if refine:
-        transformations = refine_coarse(source, target, transformations, COARSE)
+        transformations = refinement(transformations)
     candidates = _verified(transformations, origins, source, target)
     kept = distinct(np.stack([candidate.T_target_source for candidate in candidates]), centre, apart)
     candidates = [candidates[i] for i in kept]
@@ -129,10 +147,11 @@ def weigh(
 ) -> list[Candidate]:
     """Add to each candidate what its standing needs: plausibility and support."""
     total = max(float(correspondences.weights.sum()), 1e-300)
+    alike = self_agreement(source, target)
     return [
         replace(
             candidate,
-            plausibility=meet(source, target, candidate.T_target_source).plausibility,
+            plausibility=meet(source, target, candidate.T_target_source, alike).plausibility,
             support=float(
                 explained(problem, correspondences, candidate.T_target_source, tolerance).weights.sum()
                 / total

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from utopic_cli.estimation.procrustes import procrustes_batch
+from utopic_cli.estimation.procrustes import procrustes_batch, procrustes_shared
 
 MERGE_ANGLE_DEG = 10.0
 NORMAL_TOLERANCE = 0.4
 SEEDS = 1000
 NEIGHBOURS = 20
+BLOCK = 128  # rows of a large matrix made at a time: what they take stays in the cache
 
 
 @dataclass(frozen=True)
@@ -69,13 +71,7 @@ def consensus_hypotheses(
         raise ValueError("consensus needs at least three correspondences")
     if not tolerance > 0:
         raise ValueError(f"tolerance {tolerance} is not positive")
-    consistent = _consistency(source_points, target_points, tolerance)
-    if source_normals is not None and target_normals is not None:
-        difference = source_normals.astype(np.float32) @ source_normals.T.astype(
-            np.float32
-        ) - target_normals.astype(np.float32) @ target_normals.T.astype(np.float32)  # (K, K)
-        consistent &= np.abs(difference) <= NORMAL_TOLERANCE
-    first_order = consistent.astype(np.float32)
+    first_order = _consistency(source_points, target_points, tolerance, source_normals, target_normals)
     seeds = _seeds(first_order, weights)
     shared = first_order[seeds] * (first_order[seeds] @ first_order)  # (S, K)
     neighbours = min(NEIGHBOURS, count - 1)
@@ -100,16 +96,10 @@ def consensus_hypotheses(
     transformations = transformations[kept]
     for _ in range(2):  # refit to everything that agrees
         inlier = support(transformations) * weights
-        enough = np.count_nonzero(inlier, axis=1) >= 3
-        if enough.any():
-            n = int(enough.sum())
-            refitted, spread = procrustes_batch(
-                np.broadcast_to(source_points, (n, count, 3)),
-                np.broadcast_to(target_points, (n, count, 3)),
-                inlier[enough],
-            )
-            sound = np.flatnonzero(enough)[spread > 1e-6]
-            transformations[sound] = refitted[spread > 1e-6]
+        enough = np.flatnonzero(np.count_nonzero(inlier, axis=1) >= 3)
+        if len(enough):
+            refitted, spread = procrustes_shared(source_points, target_points, inlier[enough])
+            transformations[enough[spread > 1e-6]] = refitted[spread > 1e-6]
     scores = support(transformations) @ weights
     order = np.argsort(-scores, kind="stable")
     transformations, scores = transformations[order], scores[order]
@@ -133,31 +123,63 @@ def distinct(
     """
     rotations = transformations[:, :3, :3].reshape(-1, 9)
     places = transformations[:, :3, :3] @ centre + transformations[:, :3, 3]
+    near = cdist(places, places) < distance  # (H, H)
+    near &= rotations @ rotations.T > 1.0 + 2.0 * np.cos(np.radians(angle_deg))  # the trace of R_i^T R_j
+    covered = np.zeros(len(transformations), dtype=bool)
     kept: list[int] = []
     for i in range(len(transformations)):
-        cosine = (rotations[kept] @ rotations[i] - 1.0) / 2.0
-        near = np.linalg.norm(places[kept] - places[i], axis=1) < distance
-        if not (near & (cosine > np.cos(np.radians(angle_deg)))).any():
+        if not covered[i]:
             kept.append(i)
+            covered |= near[i]
     return np.array(kept, dtype=np.int64)
 
 
-def _distances(points: np.ndarray) -> np.ndarray:
-    """Pairwise distances (K, K) float32 of centred points, by one matrix product."""
-    centred = (points - points.mean(axis=0)).astype(np.float32)
-    square = np.einsum("kd,kd->k", centred, centred)
-    squared = square[:, None] + square - 2.0 * (centred @ centred.T)
+def _consistency(
+    source_points: np.ndarray,
+    target_points: np.ndarray,
+    tolerance: float,
+    source_normals: np.ndarray | None,
+    target_normals: np.ndarray | None,
+) -> np.ndarray:
+    """(K, K) float32: 1 where a pair keeps its length (and its angle between normals), else 0.
+
+    Pairs too short to say anything are left out. Row by row in blocks that fit into the cache.
+    """
+    points = [_centred(source_points), _centred(target_points)]
+    square = [np.einsum("kd,kd->k", each, each) for each in points]
+    normals = None
+    if source_normals is not None and target_normals is not None:
+        normals = source_normals.astype(np.float32), target_normals.astype(np.float32)
+    count = len(source_points)
+    result = np.empty((count, count), dtype=np.float32)
+    for start in range(0, count, BLOCK):
+        rows = slice(start, start + BLOCK)
+        source_distance, target_distance = (
+            _distances(each[rows], each, own[rows], own) for each, own in zip(points, square, strict=True)
+        )
+        consistent = np.abs(source_distance - target_distance) <= tolerance
+        consistent &= source_distance > tolerance
+        consistent &= target_distance > tolerance
+        if normals is not None:
+            difference = normals[0][rows] @ normals[0].T
+            difference -= normals[1][rows] @ normals[1].T
+            consistent &= np.abs(difference, out=difference) <= NORMAL_TOLERANCE
+        result[rows] = consistent
+    return result
+
+
+def _centred(points: np.ndarray) -> np.ndarray:
+    return (points - points.mean(axis=0)).astype(np.float32)
+
+
+def _distances(
+    some: np.ndarray, points: np.ndarray, some_square: np.ndarray, square: np.ndarray
+) -> np.ndarray:
+    """Distances (R, K) of (R, 3) points to (K, 3), given their squared lengths, by one matrix product."""
+    squared = some @ points.T
+    squared *= -2.0
+    squared += some_square[:, None] + square
     return np.sqrt(np.maximum(squared, 0.0, out=squared), out=squared)
-
-
-def _consistency(source_points: np.ndarray, target_points: np.ndarray, tolerance: float) -> np.ndarray:
-    """(K, K) bool: the pair keeps its length. Pairs too short to say anything are left out."""
-    source_distance = _distances(source_points)
-    target_distance = _distances(target_points)
-    consistent = np.abs(source_distance - target_distance) <= tolerance
-    consistent &= source_distance > tolerance
-    consistent &= target_distance > tolerance
-    return consistent
 
 
 def _seeds(first_order: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -199,13 +221,22 @@ class _Support:
 
     def __call__(self, transformations: np.ndarray) -> np.ndarray:
         """Return (H, K) in [0, 1]: 1 at no residual, 0 beyond the tolerance or against the normals."""
+        support = np.empty((len(transformations), len(self.constant)))
+        for start in range(0, len(transformations), BLOCK):
+            rows = slice(start, start + BLOCK)
+            self._block(transformations[rows], support[rows])
+        return support
+
+    def _block(self, transformations: np.ndarray, support: np.ndarray) -> None:
         rotations = transformations[:, :3, :3]
         shift = transformations[:, :3, 3] + rotations @ self.source_centre - self.target_centre
         back = np.einsum("hij,hi->hj", rotations, shift)
         square = np.einsum("hd,hd->h", shift, shift)[:, None]
         flat = rotations.reshape(-1, 9)
-        residual = np.concatenate([flat, back, shift, square], axis=1) @ self.terms + self.constant  # (H, K)
-        support = np.clip(1.0 - residual / self.tolerance**2, 0.0, 1.0)
+        np.matmul(np.concatenate([flat, back, shift, square], axis=1), self.terms, out=support)  # residuals
+        support += self.constant
+        support *= -1.0 / self.tolerance**2
+        support += 1.0
+        np.clip(support, 0.0, 1.0, out=support)
         if self.normal_terms is not None:
             support *= flat @ self.normal_terms > 1.0 - NORMAL_TOLERANCE
-        return support

@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from utopic_cli.estimation.candidates import LEAST_SUPPORT
-from utopic_cli.estimation.meeting import MEETING, meet
+from utopic_cli.estimation.meeting import MEETING, meet, self_agreement
+from utopic_cli.estimation.observability import stiffness
 from utopic_cli.estimation.solver import Estimate
 from utopic_cli.estimation.surface import Surface
 from utopic_cli.geometry import rigid
@@ -43,6 +44,7 @@ class Evidence:
         support_lead: log10 of that share over what the best supported rival explains.
         explained: natural logarithm of one plus the number of correspondences explained.
         fixed: log10 of the smallest eigenvalue of the normal matrix over the largest.
+        stiffness: see ``observability.stiffness``.
         extent: log10 of the number of voxels in which the surfaces agree.
         seen_overlap: mean overlap the network gives the points that meet the other scan.
         seen_contrast: ``seen_overlap`` minus the mean it gives the others.
@@ -67,6 +69,7 @@ class Evidence:
     support_lead: float
     explained: float
     fixed: float
+    stiffness: float
     extent: float
     seen_overlap: float
     seen_contrast: float
@@ -123,7 +126,8 @@ def collect_evidence(
         observability: None where too little overlaps to tell.
         spread: see ``Evidence``.
     """
-    meeting = meet(source, target, transformation)
+    alike = self_agreement(source, target)
+    meeting = meet(source, target, transformation, alike)
     overlap = min(meeting.source_share, meeting.target_share)
     lead = meeting.plausibility - max((rival.plausibility for rival in estimate.rivals), default=0.0)
     rival_support = max((rival.support for rival in estimate.rivals), default=0.0)
@@ -149,6 +153,7 @@ def collect_evidence(
         support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
         explained=float(np.log1p(len(estimate.correspondences))),
         fixed=_smallest_eigenvalue(observability),
+        stiffness=stiffness(source, target, transformation, meeting.likeness, alike),
         extent=float(np.log10(max(meeting.voxels, 1))),
         seen_overlap=inside,
         seen_contrast=inside - outside,

@@ -54,14 +54,17 @@ class Meeting:
         return self.likeness * float(np.sqrt(share)) - self.conflict
 
 
-def meet(source: Surface, target: Surface, transformation: np.ndarray) -> Meeting:
+def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: float | None = None) -> Meeting:
     """Measure how two surfaces lie on each other.
 
     Args:
         source: the scan that moves.
         target: the scan that stays.
         transformation: (4, 4) T_target_source.
+        alike: ``self_agreement`` of the two, if it is known already.
     """
+    if alike is None:
+        alike = self_agreement(source, target)
     forward = _one_way(source, target, transformation)
     backward = _one_way(target, source, rigid.invert(transformation))
     met, agreed = forward.met + backward.met, forward.agreed + backward.agreed
@@ -70,7 +73,6 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray) -> Meetin
     violation = (forward.violation + backward.violation) / 2.0
     share = (forward.met / forward.points + backward.met / backward.points) / 2.0
     agreement = agreed / met if met else 0.0
-    alike = max(min(_self_agreement(source), _self_agreement(target)), 0.05)
     return Meeting(
         source_share=forward.met / forward.points,
         target_share=backward.met / backward.points,
@@ -87,8 +89,12 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray) -> Meetin
     )
 
 
+def self_agreement(source: Surface, target: Surface) -> float:
+    """Share of neighbours within one scan that agree as ``meet`` asks of another's: of the rougher scan."""
+    return max(min(_self_agreement(source), _self_agreement(target)), 0.05)
+
+
 def _self_agreement(surface: Surface) -> float:
-    """Share of a scan's points whose neighbour in the same scan agrees, as ``meet`` asks of another's."""
     chosen = slice(None, None, max(1, len(surface.points) // SAMPLES))
     points, normals = surface.points[chosen], surface.normals[chosen]
     distance, index = surface.tree.query(points, k=[NEXT + 1], distance_upper_bound=MEETING * surface.voxel)

@@ -8,8 +8,12 @@ near zero belongs to a motion that slides the surfaces along each other.
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
+import numpy as np
+from scipy.linalg import expm
+
+from utopic_cli.estimation.meeting import meet
 from utopic_cli.estimation.surface import Surface
 from utopic_cli.geometry import rigid
 from utopic_cli.result import FreeMotion, Observability
@@ -24,6 +28,13 @@ FREE = 0.0015
 It is what normals that are off by two degrees make of a motion that is really free.
 """
 
+DISPLACED = 0.05
+"""Share of the scans' size by which a source is moved to see whether that is noticed: what a right
+answer may be off by."""
+
+LEAST_FIXED = 3
+"""So many of the six motions are tried."""
+
 
 def observe(source: Surface, target: Surface, transformation: np.ndarray) -> Observability:
     """Look at the overlap of two aligned surfaces.
@@ -36,6 +47,91 @@ def observe(source: Surface, target: Surface, transformation: np.ndarray) -> Obs
     Raises:
         ValueError: fewer than six points overlap, or all of them in one place.
     """
+    twists = _overlap_twists(source, target, transformation)
+    eigenvalues, vectors = twists.eigenvalues, twists.vectors
+    free = vectors[:, eigenvalues < FREE * eigenvalues[-1]]
+    # One voxel holds one independent measurement, however many points were averaged in it.
+    variance = float(np.mean(np.minimum(twists.offsets**2, (REACH * target.voxel) ** 2)))
+    floored = np.maximum(eigenvalues, 0.1 * FREE * eigenvalues[-1])
+    scale = np.concatenate([np.full(3, 1.0 / twists.radius), np.ones(3)])  # back from omega * radius to omega
+    covariance = (vectors * (variance / (twists.count * floored))) @ vectors.T * np.outer(scale, scale)
+    return Observability(
+        np.maximum(eigenvalues, 0.0),
+        _named(free, twists.radius, twists.centre),
+        covariance,
+        twists.centre,
+        twists.count,
+    )
+
+
+def stiffness(
+    source: Surface, target: Surface, transformation: np.ndarray, likeness: float, alike: float
+) -> float:
+    """Tell how much worse two surfaces agree once the source is moved by ``DISPLACED`` of their size.
+
+    The normal matrix goes by infinitely small motions and by normals, which noise tilts; here the source
+    is really moved, both ways along each of the motions that are fixed least.
+
+    Args:
+        source: the scan that moves.
+        target: the scan that stays.
+        transformation: (4, 4) T_target_source.
+        likeness: of ``meet`` under it.
+        alike: ``self_agreement`` of the two.
+
+    Returns:
+        The least fall of the likeness: 0 or less where a displaced source fits as well, and where too
+        little overlaps to tell.
+    """
+    try:
+        twists = _overlap_twists(source, target, transformation)
+    except ValueError:
+        return 0.0
+    extent = max(float(np.linalg.norm(np.ptp(surface.points, axis=0))) for surface in (source, target))
+    falls = []
+    for twist in twists.vectors.T[:LEAST_FIXED]:
+        omega, shift = twist[:3] / twists.radius, twist[3:]
+        speed = np.sqrt(np.mean(np.sum((np.cross(omega, twists.arms) + shift) ** 2, axis=1)))
+        for amount in (DISPLACED * extent / speed, -DISPLACED * extent / speed):
+            displaced = _screw(amount * omega, amount * (shift - np.cross(omega, twists.centre)))
+            falls.append(likeness - meet(source, target, displaced @ transformation, alike).likeness)
+    return float(min(falls))
+
+
+def _screw(omega: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """The motion (4, 4) that a twist about the origin makes in one unit of time."""
+    x, y, z = omega
+    generator = np.array([[0.0, -z, y, shift[0]], [z, 0.0, -x, shift[1]], [-y, x, 0.0, shift[2]], [0.0] * 4])
+    return np.asarray(expm(generator))
+
+
+@dataclass(frozen=True)
+class _Twists:
+    """The eigenvectors of the point-to-plane problem in an overlap.
+
+    Attributes:
+        eigenvalues: (6,) per point, ascending.
+        vectors: (6, 6) columns (omega * radius, v).
+        centre: (3,) middle of the overlap.
+        arms: (K, 3) its points from there.
+        radius: root mean square length of the arms.
+        offsets: (K,) signed distances of the source's points from the target's planes.
+    """
+
+    eigenvalues: np.ndarray
+    vectors: np.ndarray
+    centre: np.ndarray
+    arms: np.ndarray
+    radius: float
+    offsets: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """K, how many points overlap."""
+        return len(self.arms)
+
+
+def _overlap_twists(source: Surface, target: Surface, transformation: np.ndarray) -> _Twists:
     moved = rigid.apply(transformation, source.points)
     turned = source.normals @ transformation[:3, :3].T
     distance, index = target.tree.query(moved, distance_upper_bound=REACH * target.voxel)
@@ -52,15 +148,7 @@ def observe(source: Surface, target: Surface, transformation: np.ndarray) -> Obs
         raise ValueError("all overlapping points coincide")
     rows = np.concatenate([np.cross(arms / radius, normals), normals], axis=1)  # (K, 6)
     eigenvalues, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    free = vectors[:, eigenvalues < FREE * eigenvalues[-1]]
-    # One voxel holds one independent measurement, however many points were averaged in it.
-    variance = float(np.mean(np.minimum(offsets**2, (REACH * target.voxel) ** 2)))
-    floored = np.maximum(eigenvalues, 0.1 * FREE * eigenvalues[-1])
-    scale = np.concatenate([np.full(3, 1.0 / radius), np.ones(3)])  # back from omega * radius to omega
-    covariance = (vectors * (variance / (len(rows) * floored))) @ vectors.T * np.outer(scale, scale)
-    return Observability(
-        np.maximum(eigenvalues, 0.0), _named(free, radius, centre), covariance, centre, len(rows)
-    )
+    return _Twists(eigenvalues, vectors, centre, arms, radius, offsets)
 
 
 def _named(free: np.ndarray, radius: float, centre: np.ndarray) -> tuple[FreeMotion, ...]:

@@ -53,12 +53,42 @@ def procrustes_batch(
     centred_source = source - source_mean[:, None]
     centred_target = target - target_mean[:, None]
     covariance = (centred_source * share[..., None]).transpose(0, 2, 1) @ centred_target  # (B, 3, 3)
+    return _from_covariance(covariance, source_mean, target_mean)
+
+
+def procrustes_shared(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve B Procrustes problems over the same pairs, weighted differently, by one matrix product.
+
+    Args:
+        source: (K, 3).
+        target: (K, 3).
+        weights: (B, K) not negative, each row with a positive sum.
+
+    Returns:
+        transformations: (B, 4, 4) T_target_source.
+        spread: (B,), see ``procrustes_batch``.
+    """
+    share = weights / weights.sum(axis=1, keepdims=True)
+    # Centred on all the pairs, so that little is lost in the difference below.
+    source_centre, target_centre = source.mean(axis=0), target.mean(axis=0)
+    source, target = source - source_centre, target - target_centre
+    source_mean, target_mean = share @ source, share @ target
+    products = (source[:, :, None] * target[:, None]).reshape(-1, 9)
+    covariance = (share @ products).reshape(-1, 3, 3) - source_mean[:, :, None] * target_mean[:, None]
+    return _from_covariance(covariance, source_mean + source_centre, target_mean + target_centre)
+
+
+def _from_covariance(
+    covariance: np.ndarray, source_mean: np.ndarray, target_mean: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     u, singular, vt = np.linalg.svd(covariance)
     sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
     v = vt.transpose(0, 2, 1).copy()
     v[:, :, 2] *= sign[:, None]  # a reflection would fit mirrored noise better: forbid it
     rotation = v @ u.transpose(0, 2, 1)
-    transformations = np.zeros((len(source), 4, 4))
+    transformations = np.zeros((len(covariance), 4, 4))
     transformations[:, :3, :3] = rotation
     transformations[:, :3, 3] = target_mean - np.einsum("bij,bj->bi", rotation, source_mean)
     transformations[:, 3, 3] = 1.0

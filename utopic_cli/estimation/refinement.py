@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from utopic_cli.estimation.partners import BEYOND_CHANCE, fit_partners, partner_evidence, partner_reach
 from utopic_cli.estimation.surface import Surface, point_spacing, thinned
 from utopic_cli.geometry import rigid
+from utopic_cli.geometry.nearest import nearest
 from utopic_cli.geometry.normals import estimate_normals
 from utopic_cli.point_cloud import PointCloud
 
@@ -94,7 +95,7 @@ def _coarse_step(
     rotations = transformations[:, :3, :3].transpose(0, 2, 1)
     moved = points @ rotations + transformations[:, None, :3, 3]  # (H, S, 3)
     turned = normals @ rotations
-    distance, index = target.tree.query(moved, distance_upper_bound=radius)
+    distance, index = nearest(target.tree, moved, within=radius)
     index = np.minimum(index, len(target.points) - 1)  # "none" is len(points)
     plane = target.normals[index]
     agree = np.einsum("hsd,hsd->hs", turned, plane)
@@ -154,7 +155,13 @@ def _rotations(vectors: np.ndarray) -> np.ndarray:
 
 
 def refine(
-    source: PointCloud, target: PointCloud, T: np.ndarray, *, radius: float | None = None, limit: int = 50_000
+    source: PointCloud,
+    target: PointCloud,
+    T: np.ndarray,
+    *,
+    radius: float | None = None,
+    limit: int = 50_000,
+    trees: tuple[cKDTree, cKDTree] | None = None,
 ) -> Refinement:
     """Refine one transformation at full resolution, and keep it only where the fit improves.
 
@@ -171,6 +178,7 @@ def refine(
         T: (4, 4) T_target_source to start from, right to within ``radius``.
         radius: first search radius in the points' units; 12 times the spacing if None.
         limit: most points used of each scan; larger ones are thinned evenly.
+        trees: of all points of source and target, if there are any already.
 
     Returns:
         The better of the refined and the given transformation, with its residual; for clouds
@@ -183,8 +191,10 @@ def refine(
         raise ValueError("refinement needs at least six points in each cloud")
     if not rigid.is_rigid(T):
         raise ValueError("the transformation to refine is not rigid")
-    fixed = _FullSurface(thinned(target.points, limit))
-    moving = _FullSurface(thinned(source.points, limit))
+    moving, fixed = (
+        _FullSurface(thinned(cloud.points, limit), tree if len(cloud) <= limit else None)
+        for cloud, tree in zip((source, target), trees or (None, None), strict=True)
+    )
     spacing = max(fixed.spacing, moving.spacing)
     if not spacing > 0:
         raise ValueError("the points all coincide")
@@ -207,13 +217,26 @@ def refine(
 
 
 class _FullSurface:
-    """A cloud at full resolution with the normals and the spacing found from its own points."""
+    """A cloud at full resolution with the spacing and the normals found from its own points."""
 
-    def __init__(self, points: np.ndarray) -> None:
+    def __init__(self, points: np.ndarray, tree: cKDTree | None) -> None:
         self.points = points
-        self.tree = cKDTree(points)
+        self.tree = cKDTree(points) if tree is None else tree
         self.spacing = point_spacing(points, self.tree)
-        self.normals = estimate_normals(points, SURFACE_NEIGHBOURS)
+        self._normals = np.empty_like(points)
+        self._known = np.zeros(len(points), dtype=bool)
+
+    def normals_at(self, rows: np.ndarray) -> np.ndarray:
+        """Normals (K, 3) of arbitrary sign at (K,) rows, found when first asked for.
+
+        Of scans that share little, most points never meet the other scan.
+        """
+        missing = np.zeros(len(self.points), dtype=bool)
+        missing[rows] = True
+        missing = np.flatnonzero(missing & ~self._known)
+        self._normals[missing] = estimate_normals(self.points, SURFACE_NEIGHBOURS, tree=self.tree, at=missing)
+        self._known[missing] = True
+        return self._normals[rows]
 
 
 def _fit_partners(
@@ -236,15 +259,16 @@ def _descend(moving: _FullSurface, fixed: _FullSurface, T: np.ndarray, reach: fl
     spacing = max(fixed.spacing, moving.spacing)
     # Coarse rounds need no more than a few thousand points.
     stride = max(1, int(len(moving.points) * min(1.0, (reach / (3.0 * spacing) - 1.0) / 4.0) / 4000))
-    points, normals = moving.points[::stride], moving.normals[::stride]
+    rows = np.arange(0, len(moving.points), stride)
+    points = moving.points[rows]
     for _ in range(ITERATIONS):
         moved = rigid.apply(T, points)
-        distance, index = fixed.tree.query(moved, distance_upper_bound=reach)
+        distance, index = nearest(fixed.tree, moved, within=reach)
         near = np.flatnonzero(np.isfinite(distance))
         if len(near) < 6:
             return T
-        plane = fixed.normals[index[near]]
-        turned = normals[near] @ T[:3, :3].T
+        plane = fixed.normals_at(index[near])
+        turned = moving.normals_at(rows[near]) @ T[:3, :3].T
         agreement = np.einsum("nd,nd->n", turned, plane)
         offset = fixed.points[index[near]] - moved[near]
         mean = plane + np.where(agreement < 0, -1.0, 1.0)[:, None] * turned  # signs are arbitrary here
@@ -275,9 +299,9 @@ def _residual(moving: _FullSurface, fixed: _FullSurface, T: np.ndarray, threshol
 
 def _one_way(points: np.ndarray, surface: _FullSurface, threshold: float) -> float:
     points = thinned(points, 20_000)
-    distance, index = surface.tree.query(points, distance_upper_bound=threshold)
+    distance, index = nearest(surface.tree, points, within=threshold)
     near = np.isfinite(distance)
     residual = np.full(len(distance), threshold)
     offset = surface.points[index[near]] - points[near]
-    residual[near] = np.abs(np.einsum("nd,nd->n", offset, surface.normals[index[near]]))
+    residual[near] = np.abs(np.einsum("nd,nd->n", offset, surface.normals_at(index[near])))
     return float(residual.mean())

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from utopic_cli.estimation.candidates import Candidate, refine_candidates, screen, weigh
+from utopic_cli.estimation.candidates import Candidate, CoarseRefinement, refine_candidates, screen, weigh
 from utopic_cli.estimation.consensus import Hypothesis, consensus_hypotheses, distinct
 from utopic_cli.estimation.correspondences import (
     candidate_correspondences,
@@ -124,11 +124,12 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
     refine = solver != "svd"
     tried = min(FIRST, len(hypotheses))
     screened = screen(hypotheses[:tried], source, target, refine=refine)
-    chosen, partners = refine_candidates(problem, screened, source, target, refine=refine)
+    refinement = CoarseRefinement(source, target)
+    chosen, partners = refine_candidates(problem, screened, refinement, refine=refine)
     if not partners and chosen[0].score < BEYOND_DOUBT and tried < len(hypotheses):
         screened += screen(hypotheses[tried:], source, target, refine=refine)
         tried = len(hypotheses)
-        chosen, partners = refine_candidates(problem, screened, source, target, refine=refine)
+        chosen, partners = refine_candidates(problem, screened, refinement, refine=refine)
     correspondences = candidates
     if solver == "svd" and chosen[0].origin == "assignment":
         correspondences = _assignment(problem)

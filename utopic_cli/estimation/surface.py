@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
+from utopic_cli.geometry.nearest import nearest
 from utopic_cli.point_cloud import PointCloud
 
 MOST_PIXELS = 2000
@@ -76,7 +77,7 @@ def point_spacing(points: np.ndarray, tree: cKDTree | None = None) -> float:
         The spacing; 0 only if all points coincide.
     """
     some = thinned(points, 5_000)
-    distance, _ = (tree if tree is not None else cKDTree(points)).query(some, k=2)
+    distance, _ = nearest(cKDTree(points) if tree is None else tree, some, 2)
     spacing = float(np.median(distance[:, 1]))
     if spacing == 0.0:  # most points are there twice, as in merged files: the places count
         places = np.unique(points, axis=0)

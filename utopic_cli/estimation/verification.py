@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from utopic_cli.estimation.surface import Surface, thinned
 from utopic_cli.geometry import rigid
+from utopic_cli.geometry.nearest import nearest
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import FitMeasures
 
@@ -75,7 +76,7 @@ def _one_way(
     rotations = transformations[:, :3, :3].transpose(0, 2, 1)
     moved = moving.points[chosen] @ rotations + transformations[:, None, :3, 3]  # (H, S, 3)
     turned = moving.normals[chosen] @ rotations
-    distance, index = fixed.tree.query(moved, distance_upper_bound=REACH * fixed.voxel)
+    distance, index = nearest(fixed.tree, moved, within=REACH * fixed.voxel)
     found = np.isfinite(distance)
     index = np.where(found, index, 0)
     plane = fixed.normals[index]
@@ -94,6 +95,7 @@ def measure_fit(
     inlier_ratio: float,
     *,
     limit: int = 200_000,
+    trees: tuple[cKDTree, cKDTree] | None = None,
 ) -> FitMeasures:
     """Measure the fit at full resolution.
 
@@ -106,6 +108,7 @@ def measure_fit(
         inlier_ratio: share of the correspondences that T explains, as the solver found it
             (``Estimate.support``); passed on.
         limit: most points of each scan that are looked up; larger scans are thinned evenly.
+        trees: of source and target, if there are any already.
 
     Returns:
         Measures in the points' units. ``residual_percentiles`` are over the source's points
@@ -118,8 +121,11 @@ def measure_fit(
         raise ValueError("an empty cloud has no fit")
     if not threshold > 0:
         raise ValueError(f"threshold {threshold} is not positive")
-    forward = _nearest(rigid.apply(T, source.points), target.points, threshold, limit)
-    backward = _nearest(rigid.apply(rigid.invert(T), target.points), source.points, threshold, limit)
+    source_tree, target_tree = trees or (cKDTree(source.points), cKDTree(target.points))
+    # Thinned before it is moved: which points are left depends on their number alone.
+    some_source, some_target = thinned(source.points, limit), thinned(target.points, limit)
+    forward, _ = nearest(target_tree, rigid.apply(T, some_source), within=threshold)
+    backward, _ = nearest(source_tree, rigid.apply(rigid.invert(T), some_target), within=threshold)
     found = forward[np.isfinite(forward)]
     source_ratio, target_ratio = float(np.isfinite(forward).mean()), float(np.isfinite(backward).mean())
     names = ("p50", "p75", "p90", "p95")
@@ -131,9 +137,3 @@ def measure_fit(
         residual_percentiles={name: float(value) for name, value in zip(names, values, strict=True)},
         threshold=float(threshold),
     )
-
-
-def _nearest(points: np.ndarray, others: np.ndarray, threshold: float, limit: int) -> np.ndarray:
-    """Distance of up to ``limit`` of the points to the nearest other one, inf beyond threshold."""
-    distance, _ = cKDTree(others).query(thinned(points, limit), distance_upper_bound=threshold)
-    return distance

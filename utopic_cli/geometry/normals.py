@@ -7,8 +7,19 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from utopic_cli.geometry.nearest import nearest
 
-def estimate_normals(points: np.ndarray, neighbours: int = 30, radius: float = np.inf) -> np.ndarray:
+BLOCK = 4096  # points looked at at a time: what they take stays in the cache
+
+
+def estimate_normals(
+    points: np.ndarray,
+    neighbours: int = 30,
+    radius: float = np.inf,
+    *,
+    tree: cKDTree | None = None,
+    at: np.ndarray | None = None,
+) -> np.ndarray:
     """Fit a plane to each point's neighbourhood.
 
     Args:
@@ -16,19 +27,33 @@ def estimate_normals(points: np.ndarray, neighbours: int = 30, radius: float = n
         neighbours: most neighbours used, the point itself included.
         radius: neighbours farther away are ignored (points' units); where fewer than three
             are left, the nearest ones are used all the same.
+        tree: of the points, if there is one already.
+        at: (K,) rows of the points whose normals are asked for; None for all.
 
     Returns:
-        (N, 3) float64 unit normals of arbitrary sign.
+        (N, 3), or (K, 3), float64 unit normals of arbitrary sign.
     """
     k = min(neighbours, len(points))
-    distance, index = cKDTree(points).query(points, k=k)
-    weight = (distance <= radius).astype(np.float64)
-    weight[:, : min(3, k)] = 1.0
-    offsets = points[index] - points[:, None]  # (N, k, 3)
-    weight /= weight.sum(axis=1, keepdims=True)
-    mean = np.einsum("nk,nkd->nd", weight, offsets)
-    centred = offsets - mean[:, None]
-    covariance = np.einsum("nkd,nke->nde", weight[..., None] * centred, centred)
+    tree = cKDTree(points) if tree is None else tree
+    rows = np.arange(len(points)) if at is None else at
+    axes = np.ascontiguousarray(points.T)  # coordinate by coordinate, each sum below runs along memory
+    distances, indices = nearest(tree, points[rows], range(1, k + 1))
+    covariance = np.empty((len(rows), 3, 3))
+    for start in range(0, len(rows), BLOCK):
+        block = slice(start, start + BLOCK)
+        index = indices[block]
+        weight = (distances[block] <= radius).astype(np.float64)
+        weight[:, : min(3, k)] = 1.0
+        weight /= weight.sum(axis=1, keepdims=True)
+        centred = []
+        for axis in axes:
+            offset = axis[index] - axis[rows[block], None]  # (B, k)
+            centred.append(offset - np.einsum("nk,nk->n", weight, offset)[:, None])
+        for i in range(3):
+            weighted = weight * centred[i]
+            for j in range(i, 3):
+                entry = np.einsum("nk,nk->n", weighted, centred[j])
+                covariance[block, i, j] = covariance[block, j, i] = entry
     return _smallest_eigenvector(covariance)
 
 

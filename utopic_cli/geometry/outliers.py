@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from utopic_cli.geometry.nearest import nearest
+
 NEIGHBOURS = 12
 FAR = 3.0
 """Scattered points are at least this many times farther from their neighbours than the median point ..."""
@@ -34,19 +36,20 @@ def astray(points: np.ndarray) -> np.ndarray:
     return radius > ASTRAY * np.quantile(radius, 0.95)
 
 
-def scattered(points: np.ndarray) -> np.ndarray:
+def scattered(points: np.ndarray, tree: cKDTree | None = None) -> np.ndarray:
     """Tell which points lie on no surface.
 
     Args:
         points: (N, 3) in any unit.
+        tree: of the points, if there is one already.
 
     Returns:
         (N,) bool; nothing is told of fewer than a few dozen points.
     """
     if len(points) < 3 * NEIGHBOURS:
         return np.zeros(len(points), dtype=bool)
-    tree = cKDTree(points)
-    distance, index = tree.query(points, k=NEIGHBOURS + 1, workers=-1)
+    tree = cKDTree(points) if tree is None else tree
+    distance, index = nearest(tree, points, NEIGHBOURS + 1)
     mean = distance[:, 1:].mean(axis=1)
     if not np.median(mean) > 0:  # most places are there many times: distances say nothing
         return np.zeros(len(points), dtype=bool)

@@ -76,6 +76,12 @@ def _filled(values: Tensor, most: int) -> Tensor:
     return torch.cat([values, values.new_zeros(values.shape[0], missing, *values.shape[2:])], dim=1)
 
 
+def highest(values: Tensor) -> Tensor:
+    """Maximum of (B, N, K, C) over K -> (B, N, C)."""
+    # Without the indices that only a gradient needs, it is several times faster.
+    return values.max(dim=2).values if values.requires_grad else values.amax(dim=2)
+
+
 def gather(values: Tensor, index: Tensor) -> Tensor:
     """Pick rows: values (B, N, C), index (B, N, k) -> (B, N, k, C).
 

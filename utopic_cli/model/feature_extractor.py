@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from utopic_cli.config import ModelConfig
-from utopic_cli.model.cloud_input import CloudInput, gather
+from utopic_cli.model.cloud_input import CloudInput, gather, highest
 from utopic_cli.model.local_geometry import EDGE_INVARIANTS, LocalGeometryEncoder, edge_invariants
 
 
@@ -68,7 +68,7 @@ class AdaptConv(nn.Module):
         else:
             kernel = torch.cat([kernel, torch.ones_like(kernel[..., :1])], dim=-1)
             convolved = self.output((kernel[..., :, None] * edges[..., None, :]).flatten(-2))
-        strongest = convolved.max(dim=2).values  # (B, N, C_out)
+        strongest = highest(convolved)  # (B, N, C_out)
         return nn.functional.leaky_relu(self.norm(strongest) + self.shortcut(features), 0.2)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from utopic_cli.model.cloud_input import CloudInput
+from utopic_cli.model.cloud_input import CloudInput, highest
 
 EDGE_INVARIANTS = 9
 
@@ -67,9 +67,9 @@ class LocalGeometryEncoder(nn.Module):
             invariants = edge_invariants(patch[..., :3], cloud.normals[:, :, None], patch[..., 3:])
             per_point = points(invariants)  # (B, N, K, hidden)
             outside = ~mask[..., None]
-            highest = per_point.masked_fill(outside, -1e4).max(dim=2).values
-            highest = highest.masked_fill(~mask.any(dim=2, keepdim=True), 0.0)
+            strongest = highest(per_point.masked_fill(outside, -1e4))
+            strongest = strongest.masked_fill(~mask.any(dim=2, keepdim=True), 0.0)
             count = mask.sum(dim=2, keepdim=True).clamp_min(1)
             mean = per_point.masked_fill(outside, 0.0).sum(dim=2) / count
-            encoded.append(summary(torch.cat([highest, mean], dim=-1)))
+            encoded.append(summary(torch.cat([strongest, mean], dim=-1)))
         return nn.functional.leaky_relu(self.norm(torch.cat(encoded, dim=-1)), 0.2)

@@ -67,7 +67,10 @@ class UncertaintyQuantification(nn.Module):
         noise = torch.randn(shape, generator=generator).to(mean.device)
         deviation = (0.5 * log_variance).exp()
         samples = torch.sigmoid(mean[:, None] + noise * deviation[:, None])
-        raw = deviation if self.scheme == "predicted" else samples.var(dim=1, unbiased=False)
+        if self.scheme == "none":  # nothing has taught the deviation anything
+            raw = torch.zeros_like(mean)
+        else:
+            raw = deviation if self.scheme == "predicted" else samples.var(dim=1, unbiased=False)
         return OverlapDistribution(mean, log_variance, samples, raw)
 
 

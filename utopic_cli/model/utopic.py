@@ -23,6 +23,18 @@ from utopic_cli.model.uncertainty import (
 )
 
 
+class EncodedCloud(NamedTuple):
+    """What the network finds in a cloud of N points whatever it is aligned with.
+
+    Attributes:
+        features: (B, N, V) extractor features F.
+        descriptors: (B, N, D) unit descriptors.
+    """
+
+    features: Tensor
+    descriptors: Tensor
+
+
 class Prediction(NamedTuple):
     """Everything the network says about a batch of pairs of N and M points.
 
@@ -88,6 +100,10 @@ class Utopic(nn.Module):
             self.hypothesis = nn.Linear(HYPOTHESIS_FEATURES, width, bias=False)
             nn.init.zeros_(self.hypothesis.weight)
 
+    def encode(self, cloud: CloudInput) -> EncodedCloud:
+        """Find what depends on one cloud alone and takes little memory to keep."""
+        return EncodedCloud(*self.extractor(cloud))
+
     def forward(
         self,
         source: CloudInput,
@@ -97,6 +113,7 @@ class Utopic(nn.Module):
         masking: bool = False,
         hypothesis: Tensor | None = None,
         hypothesis_present: Tensor | None = None,
+        encoded: tuple[EncodedCloud, EncodedCloud] | None = None,
     ) -> Prediction:
         """Predict correspondences, overlap and uncertainty.
 
@@ -107,9 +124,11 @@ class Utopic(nn.Module):
             masking: drop features at random in proportion to uncertainty (training only).
             hypothesis: (B, 4, 4) T_target_source under test, in normalised units, or None.
             hypothesis_present: (B,) 1 or 0 for each pair; all 1 if None.
+            encoded: of source and target, where it is known already.
         """
-        source_features, source_descriptors = self.extractor(source)
-        target_features, target_descriptors = self.extractor(target)
+        if encoded is None:
+            encoded = self.encode(source), self.encode(target)
+        (source_features, source_descriptors), (target_features, target_descriptors) = encoded
         similarity = source_descriptors @ target_descriptors.transpose(1, 2)
 
         source_embedding = target_embedding = None

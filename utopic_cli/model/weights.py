@@ -14,21 +14,8 @@ from safetensors.torch import save as save_tensors
 
 from utopic_cli.config import ModelConfig, from_dict, to_dict
 from utopic_cli.errors import InputError
+from utopic_cli.model.bundled import bundled_weights
 from utopic_cli.model.utopic import Utopic
-
-
-def weights_folders() -> tuple[Path, Path]:
-    """Where bundled weights can be: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent.parent
-    return package / "_weights", package.parent / "weights"
-
-
-def bundled_weights() -> dict[str, Path]:
-    """Return the bundled weights files by name."""
-    found: dict[str, Path] = {}
-    for folder in reversed(weights_folders()):
-        found.update({path.stem: path for path in sorted(folder.glob("*.safetensors"))})
-    return found
 
 
 def find_weights(name_or_path: str) -> Path:

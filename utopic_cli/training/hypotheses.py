@@ -6,8 +6,9 @@ import numpy as np
 
 from utopic_cli.estimation.refinement import Stage, refine_coarse
 from utopic_cli.estimation.surface import make_surface
+from utopic_cli.frame import DENSE_RATIO
 from utopic_cli.geometry import rigid
-from utopic_cli.preprocess import DENSE_RATIO, PreparedPair
+from utopic_cli.preprocess import PreparedPair
 
 NONE, NEARLY_RIGHT = 0.4, 0.8
 """Cumulative shares of pairs shown no hypothesis, and a right or nearly right one; the rest is wrong."""

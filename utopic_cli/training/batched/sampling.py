@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from utopic_cli.frame import DENSE_RATIO
 from utopic_cli.model.cloud_input import CloudInput
-from utopic_cli.preprocess import DENSE_RATIO, PATCHES
+from utopic_cli.preprocess import PATCHES
 from utopic_cli.training.batched.draws import Draws, unit
 from utopic_cli.training.batched.normals import NEIGHBOURS, faced, guessed_signs, plane_normals
 from utopic_cli.training.batched.ragged import (

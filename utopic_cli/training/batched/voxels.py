@@ -73,7 +73,7 @@ def _keys(cell: Tensor, cloud: Tensor) -> Tensor:
 
 
 def common_spacing(points: Tensor, cloud: Tensor, clouds: int, most: int) -> Tensor:
-    """Find the node spacing h (C / 2,) of each pair; see ``preprocess._common_spacing``.
+    """Find the node spacing h (C / 2,) of each pair; see ``frame._common_spacing``.
 
     Args:
         points: (T, 3) normalised points of all clouds; clouds 2 b and 2 b + 1 are a pair.
@@ -85,7 +85,7 @@ def common_spacing(points: Tensor, cloud: Tensor, clouds: int, most: int) -> Ten
     bound = torch.tensor([[1e-4], [2.0]], dtype=torch.float64, device=points.device).repeat(1, clouds)
     low, high = bound.unbind(0)
     corner = lowest_corners(points, cloud, clouds)
-    # The bracket shrinks alike for all clouds, to a ratio of 1.015 as in preprocess.
+    # The bracket shrinks alike for all clouds, to a ratio of 1.015 as in frame.
     for _ in range(math.ceil(math.log2(math.log(2.0 / 1e-4) / math.log(1.015)))):
         size = (low * high).sqrt()
         occupied = torch.unique(_keys(cell_of(points, cloud, corner, size.float()), cloud))
@@ -99,7 +99,7 @@ def common_spacing(points: Tensor, cloud: Tensor, clouds: int, most: int) -> Ten
 def own_spacing(points: Tensor, cloud: Tensor, count: Tensor, limit: int) -> Tensor:
     """Return the spacing (C,) of clouds of fewer than ``limit`` points; 0 for the others.
 
-    It is 0.75 of the median distance of the 8th neighbour; see ``preprocess._own_spacing``.
+    It is 0.75 of the median distance of the 8th neighbour; see ``frame._own_spacing``.
     """
     spacing = torch.zeros(len(count), device=points.device)
     start = count.cumsum(0) - count
