@@ -52,7 +52,7 @@ def test_the_threshold_holds_on_other_outcomes() -> None:
 
 def test_what_is_ruled_out_anyway_does_not_raise_the_threshold() -> None:
     def accepted(fixed: float) -> float:
-        loud = {"margin": 1.0, "noise": 0.0, "fixed": fixed, "conflict": -2.5, "spread": -3.0, "stiffness": 0.5}
+        loud = {"margin": 1.0, "noise": 0.0, **FINE, "fixed": fixed}
         wrong = [Outcome(3000 + i, "symmetric", False, loud) for i in range(30)]
         return fit(outcomes(3000, 4, 12.0) + wrong, {}).description["out_of_fold"]["right_accepted"]
 

@@ -6,36 +6,29 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from utopic_cli.errors import InputError, UtopicError
-from utopic_cli.io.output import write_together
-from utopic_cli.model.utopic import Utopic
-from utopic_cli.model.weights import pack_weights
-from utopic_cli.synthesis.pairs import random_pair
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.training.batched import BatchedPairs, batches_on_device
-from utopic_cli.training.checkpoint import describe_difference, read_checkpoint, write_checkpoint
-from utopic_cli.training.config import Schedule, TrainingConfig, training_config_from
-from utopic_cli.training.data import BatchOrder, SynthesisedPairs, batch_loader, sample_pair, to_training_pair
+from utopic_cli.training.config import Schedule, TrainingConfig
+from utopic_cli.training.data import BatchOrder, SynthesisedPairs, batch_loader
 from utopic_cli.training.journal import Journal
 from utopic_cli.training.network import TrainingNetwork, TrainingPair, total_loss
-from utopic_cli.training.optimisation import RunningAverage, learning_rate, make_optimiser, step
+from utopic_cli.training.optimisation import learning_rate, step
+from utopic_cli.training.pace import Limits, Meter, caught_signals
 from utopic_cli.training.processes import Processes, joined_processes
-from utopic_cli.training.validation import validate
+from utopic_cli.training.run import Run, export, start_run, total_pairs
+from utopic_cli.training.validation import PeriodicValidation, validation_pairs
 
 log = logging.getLogger(__name__)
 
 Progress = Callable[[dict[str, Any]], None]
-VALIDATION_SEED = 900_001
-VALIDATION_POINTS = 768
 RECORD_SECONDS = 20.0
 
 
@@ -86,15 +79,15 @@ def train(
         OutputError: the folder can't be written.
     """
     device = device or torch.device("cpu")
-    with joined_processes(device) as processes, _signals() as received:
+    with joined_processes(device) as processes, caught_signals() as received:
         if config.schedule.batch % processes.count:
             raise InputError(
                 f"batch {config.schedule.batch} can't be shared by {processes.count} processes; "
                 "choose a multiple in the configuration"
             )
         out.mkdir(parents=True, exist_ok=True)
-        run = _start(config, device, out, resume, start_from)
-        limits = _Limits(minutes, lambda: bool(received))
+        run = start_run(config, device, out, resume, start_from)
+        limits = Limits(minutes, lambda: bool(received))
         on_device = synthesis == "device" or (synthesis == "auto" and device.type == "cuda")
         batches = _batches(run, training_shapes, processes, None if on_device else workers)
         measured = _loop(run, batches, validation_shapes, processes, limits, progress)
@@ -116,98 +109,8 @@ def train(
         return path
 
 
-@dataclass
-class _Run:
-    """The state of a run: what a checkpoint holds."""
-
-    config: TrainingConfig
-    device: torch.device
-    out: Path
-    network: TrainingNetwork
-    optimiser: torch.optim.Optimizer
-    average: RunningAverage
-    done: int = 0
-    elapsed: float = 0.0
-
-    @property
-    def checkpoint(self) -> Path:
-        return self.out / "checkpoint.pt"
-
-    def save(self) -> None:
-        write_checkpoint(
-            self.checkpoint,
-            {
-                "config": self.config.as_dict(),
-                "model": self.network.state_dict(),
-                "optimiser": self.optimiser.state_dict(),
-                "average": self.average.weights,
-                "pairs": self.done,
-                "elapsed_s": self.elapsed,
-            },
-        )
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """When to stop before the schedule ends."""
-
-    minutes: float | None
-    asked: Callable[[], bool]
-    started: float = field(default_factory=time.monotonic)
-
-    def seconds_left(self) -> float:
-        """Seconds until time is up; infinite without a limit."""
-        if self.minutes is None:
-            return math.inf
-        return 60.0 * self.minutes - (time.monotonic() - self.started)
-
-
-def _start(
-    config: TrainingConfig,
-    device: torch.device,
-    out: Path,
-    resume: bool,
-    start_from: dict[str, torch.Tensor] | None,
-) -> _Run:
-    """Build everything a run consists of, new or as a checkpoint left it."""
-    schedule = config.schedule
-    torch.manual_seed(schedule.seed)  # initial weights only; every later draw has its own generator
-    network = TrainingNetwork(
-        config.model, config.loss.correspondence_radius, config.loss.completion_points
-    ).to(device)
-    if start_from is not None:
-        changed = describe_difference(start_from, network.inference.state_dict())
-        if changed:
-            raise InputError(f"the weights to start from have another architecture: {changed}")
-        network.inference.load_state_dict(start_from)
-    run = _Run(
-        config,
-        device,
-        out,
-        network,
-        make_optimiser(network, schedule),
-        RunningAverage(network.inference, schedule.average),
-    )
-    if resume:
-        state = read_checkpoint(run.checkpoint)
-        other = training_config_from(state["config"], str(run.checkpoint))
-        if other != config:
-            changed = describe_difference(other.as_dict(), config.as_dict())
-            raise InputError(
-                f"{run.checkpoint}: made with other settings ({changed}); use the same --config to resume"
-            )
-        changed = describe_difference(state["model"], network.state_dict())
-        if changed:
-            raise InputError(f"{run.checkpoint}: holds another architecture: {changed}")
-        network.load_state_dict(state["model"])
-        run.optimiser.load_state_dict(state["optimiser"])
-        run.average.restore(state["average"])
-        run.done, run.elapsed = state["pairs"], state["elapsed_s"]
-    return run
-
-
 def _batches(
-    run: _Run, shapes: ShapeLibrary, processes: Processes, workers: int | None
+    run: Run, shapes: ShapeLibrary, processes: Processes, workers: int | None
 ) -> Iterable[TrainingPair]:
     """What is left of the run, as this process' share of each batch.
 
@@ -234,11 +137,11 @@ def _batches(
 
 
 def _loop(
-    run: _Run,
+    run: Run,
     batches: Iterable[TrainingPair],
     validation_shapes: ShapeLibrary,
     processes: Processes,
-    limits: _Limits,
+    limits: Limits,
     progress: Progress | None,
 ) -> dict[str, float]:
     """Go through the batches; returns the last validation."""
@@ -246,12 +149,12 @@ def _loop(
     weights = run.config.loss.weights()
     # On CPUs without matrix units bfloat16 costs half as much again, so only GPUs get it.
     reduced = schedule.bfloat16 and device.type == "cuda"
-    held_out = _validation_pairs(validation_shapes, run.config) if processes.leads else []
+    held_out = validation_pairs(validation_shapes, run.config) if processes.leads else []
     measured: dict[str, float] = {}
-    meter = _Meter()
+    meter = Meter()
     begun, elapsed_before = time.monotonic(), run.elapsed
     last_saved = -math.inf  # the first checkpoint comes with the first record
-    validation = _Validation(held_out, schedule, limits)
+    validation = PeriodicValidation(held_out, schedule, limits)
     settings = run.config.as_dict()
     with Journal(run.out, run.done, settings=settings) if processes.leads else nullcontext() as journal:
         if journal is not None and not run.done:  # what the untrained network makes of them
@@ -262,7 +165,7 @@ def _loop(
             if progress is not None:
                 progress(first)
             begun = time.monotonic()
-            meter = _Meter()
+            meter = Meter()
         asked = time.monotonic()
         for batch in batches:
             meter.waited += time.monotonic() - asked
@@ -309,80 +212,14 @@ def _loop(
                 journal.write(record)
                 if progress is not None:
                     progress(record)
-                meter = _Meter()
+                meter = Meter()
             if last:
                 break
             asked = time.monotonic()
     return measured
 
 
-class _Validation:
-    """Validates now and then, and never for more than a tenth of the time."""
-
-    def __init__(self, pairs: list[TrainingPair], schedule: Schedule, limits: _Limits) -> None:
-        self.pairs, self.seed = pairs, schedule.seed
-        self.seconds = 0.0  # how long the last one took
-        self.patience = min(schedule.validation_seconds, limits.seconds_left() / 8)
-        self.last = time.monotonic()
-
-    def due(self) -> bool:
-        """Whether it is time again."""
-        return time.monotonic() - self.last > max(self.patience, 9.0 * self.seconds)
-
-    def __call__(self, run: _Run, joint: bool) -> dict[str, float]:
-        """Measure the averaged weights; before the joint stage only what is being trained."""
-        begun = time.monotonic()
-        model = run.average.network(run.network.inference)
-        measured = validate(model, self.pairs, self.seed, descriptors_only=not joint)
-        self.last = time.monotonic()
-        self.seconds = self.last - begun
-        return {name: round(value, 4) for name, value in measured.items()}
-
-
-class _Meter:
-    """Sums since the last record; read as floats only then, so that a GPU is never waited for."""
-
-    def __init__(self) -> None:
-        self.begun = time.monotonic()
-        self.waited = 0.0
-        self.pairs = self.batches = 0
-        self.sums: dict[str, torch.Tensor] = {}
-
-    def add(self, terms: dict[str, torch.Tensor], pairs: int) -> None:
-        """Count one batch."""
-        for name, term in terms.items():
-            self.sums[name] = self.sums.get(name, torch.zeros_like(term.detach())) + term.detach()
-        self.pairs, self.batches = self.pairs + pairs, self.batches + 1
-
-    def seconds(self) -> float:
-        """Seconds since the last record."""
-        return time.monotonic() - self.begun
-
-    def rate(self) -> float:
-        """Pairs a second."""
-        return self.pairs / max(self.seconds(), 1e-9)
-
-    def read(self) -> dict[str, float]:
-        """Return speed, share of the time spent waiting for pairs, and mean loss terms."""
-        means = {name: round(float(value) / self.batches, 4) for name, value in self.sums.items()}
-        waiting = self.waited / max(self.seconds(), 1e-9)
-        return {"pairs_per_s": round(self.rate(), 2), "waiting": round(waiting, 3), **means}
-
-
-def export(model: Utopic, card: dict[str, Any], out: Path) -> Path:
-    """Write weights and card to a folder, both or neither."""
-    blob, text = pack_weights(model, card)
-    path = out / "utopic.safetensors"
-    write_together({path.with_suffix(".json"): text, path: blob}, overwrite=True)
-    return path
-
-
-def total_pairs(schedule: Schedule) -> int:
-    """Return how many pairs a run sees."""
-    return schedule.descriptor_pairs + schedule.joint_pairs
-
-
-def _seconds_left(run: _Run, rate: float, limits: _Limits) -> float:
+def _seconds_left(run: Run, rate: float, limits: Limits) -> float:
     """Seconds to the end at the present pace, or to when time is up."""
     schedule = run.config.schedule
     return max(0.0, min((total_pairs(schedule) - run.done) / max(rate, 1e-9), limits.seconds_left()))
@@ -408,33 +245,6 @@ def _limits_of(pairs: int, schedule: Schedule) -> tuple[int, int]:
     return fewest, most
 
 
-def _validation_pairs(shapes: ShapeLibrary, config: TrainingConfig) -> list[TrainingPair]:
-    made = []
-    for number in range(config.schedule.validation_pairs):
-        rng = np.random.default_rng([VALIDATION_SEED, number])
-        pair = random_pair(shapes, rng, config.pairs)
-        made.append(to_training_pair(sample_pair(pair, VALIDATION_POINTS, rng), config.model.neighbours))
-    return made
-
-
 def _to(pair: TrainingPair, device: torch.device) -> TrainingPair:
     source, target, *answers = pair
     return TrainingPair(source.to(device), target.to(device), *(answer.to(device) for answer in answers))
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collect SIGTERM and the first Ctrl-C, so that the step in hand is finished and saved."""
-    received: list[int] = []
-
-    def note(number: int, _: object) -> None:
-        if number in received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    previous = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

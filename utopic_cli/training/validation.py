@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from utopic_cli.model.utopic import Prediction, Utopic
+from utopic_cli.synthesis.pairs import random_pair
+from utopic_cli.synthesis.shapes import ShapeLibrary
+from utopic_cli.training.config import Schedule, TrainingConfig
+from utopic_cli.training.data import sample_pair, to_training_pair
 from utopic_cli.training.labels import POSITIVE_REACH, Labels, label_pair
 from utopic_cli.training.network import TrainingPair
+from utopic_cli.training.pace import Limits
+from utopic_cli.training.run import Run
+
+VALIDATION_SEED = 900_001
+VALIDATION_POINTS = 768
 
 
 @torch.no_grad()
@@ -81,3 +92,37 @@ def _share_within(scores: Tensor, error: Tensor, rows: Tensor) -> float:
         return 0.0
     chosen = scores.argmax(dim=1, keepdim=True)
     return float((error.gather(1, chosen)[rows, 0] < 2.0 * POSITIVE_REACH).float().mean())
+
+
+class PeriodicValidation:
+    """Validates now and then, and never for more than a tenth of the time."""
+
+    def __init__(self, pairs: list[TrainingPair], schedule: Schedule, limits: Limits) -> None:
+        """Validate on these pairs."""
+        self.pairs, self.seed = pairs, schedule.seed
+        self.seconds = 0.0  # how long the last one took
+        self.patience = min(schedule.validation_seconds, limits.seconds_left() / 8)
+        self.last = time.monotonic()
+
+    def due(self) -> bool:
+        """Whether it is time again."""
+        return time.monotonic() - self.last > max(self.patience, 9.0 * self.seconds)
+
+    def __call__(self, run: Run, joint: bool) -> dict[str, float]:
+        """Measure the averaged weights; before the joint stage only what is being trained."""
+        begun = time.monotonic()
+        model = run.average.network(run.network.inference)
+        measured = validate(model, self.pairs, self.seed, descriptors_only=not joint)
+        self.last = time.monotonic()
+        self.seconds = self.last - begun
+        return {name: round(value, 4) for name, value in measured.items()}
+
+
+def validation_pairs(shapes: ShapeLibrary, config: TrainingConfig) -> list[TrainingPair]:
+    """Make the held-out pairs of a run: always the same for the same shapes and settings."""
+    made = []
+    for number in range(config.schedule.validation_pairs):
+        rng = np.random.default_rng([VALIDATION_SEED, number])
+        pair = random_pair(shapes, rng, config.pairs)
+        made.append(to_training_pair(sample_pair(pair, VALIDATION_POINTS, rng), config.model.neighbours))
+    return made
