@@ -16,23 +16,30 @@ from typer.core import TyperGroup
 
 from utopic_cli import __version__
 from utopic_cli.commands.align import align
+from utopic_cli.commands.apply import apply
 from utopic_cli.commands.batch import batch
-from utopic_cli.commands.bench import bench
+from utopic_cli.commands.bench import bench, group
 from utopic_cli.commands.bench_batch import batch_bench
 from utopic_cli.commands.bench_confidence import confidence
-from utopic_cli.commands.bench_curves import mount as mount_curves
 from utopic_cli.commands.bench_speed import speed
+from utopic_cli.commands.bench_synthetic import mount as mount_synthetic
+from utopic_cli.commands.bench_variants import mount as mount_variants
 from utopic_cli.commands.calibrate import calibrate
 from utopic_cli.commands.console import debug_wanted
 from utopic_cli.commands.demo import demo
 from utopic_cli.commands.info import info
 from utopic_cli.commands.train import train
+from utopic_cli.commands.transformation import transformation
 from utopic_cli.errors import UtopicError
 
 # The base class of usage errors has moved between Typer's versions (click, then a copy of it),
 # so it is taken from a class that is exported by all of them.
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
 _PASSED_ON = (typer.Exit, typer.Abort)
+
+_ALIGN = "Align scans"
+_FIRST = "First steps"
+_OWN = "Weights of your own"
 
 
 class Door(TyperGroup):
@@ -105,20 +112,26 @@ def roof(
 
     SOURCE is the scan that moves and is named first, TARGET stays.
     Scans come in any unit, any pose and any density.
+
+    Example: [bold]utopic align a.ply b.ply --out-dir result[/bold]
     """
 
 
-app.command()(align)
-app.command()(batch)
-app.command()(demo)
-app.command()(info)
-app.command()(train)
-app.command()(calibrate)
+app.command(rich_help_panel=_ALIGN)(align)
+app.command(rich_help_panel=_ALIGN)(batch)
+app.command(rich_help_panel=_ALIGN)(apply)
+app.command(rich_help_panel=_ALIGN)(transformation)
+app.command(rich_help_panel=_FIRST)(demo)
+app.command(rich_help_panel=_FIRST)(info)
+app.command(rich_help_panel=_OWN)(train)
+app.command(rich_help_panel=_OWN)(calibrate)
 bench.command()(confidence)
 bench.command("batch")(batch_bench)
-mount_curves(bench)
+mount_synthetic(bench)
+mount_variants(bench)
 bench.command()(speed)
-app.add_typer(bench, name="bench")
+group(bench)
+app.add_typer(bench, name="bench", rich_help_panel=_OWN)
 
 
 def main() -> None:

@@ -25,7 +25,14 @@ def test_registers_an_easy_pair_the_same_way_twice(folder: ScanFolder, name: str
 
 
 def test_the_settings_are_the_ones_the_tables_name() -> None:
-    assert list(BASELINES) == ["open3d-ransac", "open3d-ransac-fine", "open3d-fgr", "kiss-matcher"]
+    assert list(BASELINES) == [
+        "open3d-ransac",
+        "open3d-ransac-fine",
+        "open3d-fgr",
+        "open3d-icp",
+        "kiss-matcher",
+        "small-gicp",
+    ]
     coarse, fine = BASELINES["open3d-ransac"], BASELINES["open3d-ransac-fine"]
     assert (coarse.voxels_per_extent, coarse.iterations) == (50, 100_000)  # type: ignore[attr-defined]
     assert (fine.voxels_per_extent, fine.iterations) == (120, 2_000_000)  # type: ignore[attr-defined]

@@ -14,14 +14,17 @@ from utopic_cli.benchmark.curves import (
     CLEAN,
     KEPT,
     PARAMETERS,
+    QUOTED_OVERLAPS,
     CurveProtocol,
     SweepProtocol,
+    cropped,
     with_density,
     with_noise,
     with_outliers,
     with_rotation,
 )
 from utopic_cli.benchmark.pair_metrics import PoseMeasures
+from utopic_cli.benchmark.protocols import CropProtocol
 from utopic_cli.benchmark.result_page import page
 from utopic_cli.benchmark.synthetic import run
 from utopic_cli.benchmark.synthetic_report import render
@@ -129,6 +132,13 @@ def test_the_sweep_keeps_fewer_points_and_less_overlap(shapes: ShapeLibrary, sam
     assert overlaps == sorted(overlaps, reverse=True) and overlaps[-1] < overlaps[0] - 0.05
 
 
+def test_the_mean_overlaps_are_about_the_papers(shapes: ShapeLibrary) -> None:
+    whole = [CropProtocol("whole", 1.0, "shared", "euler45").pair(shapes, 7, number) for number in range(2)]
+    for count, quoted in zip(KEPT, QUOTED_OVERLAPS, strict=True):
+        pairs = [cropped(whole[draw % 2], count, np.random.default_rng(draw)) for draw in range(80)]
+        assert np.mean([pair.smaller_overlap for pair in pairs]) == pytest.approx(quoted, abs=0.03)
+
+
 def test_crops_are_nearest_to_viewpoints_on_opposite_sides(shapes: ShapeLibrary) -> None:
     for number in range(0, 40, len(KEPT)):
         pair = SweepProtocol().pair(shapes, 7, number)
@@ -166,7 +176,7 @@ def test_a_curve_is_told_by_level_in_table_json_and_page() -> None:
     assert [row.success.share for _, row in curve] == [1.0, 0.5]
     out = io.StringIO()
     render(report, Console(file=out, width=200))
-    assert "50.0%" in out.getvalue() and "fpfh: no answer 1 times: none" in out.getvalue()
+    assert "50.0%" in out.getvalue() and "fpfh: no answer to 1 of the pairs: none" in out.getvalue()
     assert len(json.loads(report.to_json())["summary"]) == 5
     text = page(report)
     assert text.count("<svg") == 2 and "a &lt;b&gt; &amp; [c]" in text and "fpfh: no answer" in text

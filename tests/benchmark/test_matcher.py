@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.benchmark.conftest import bumpy_object
+from utopic_cli.benchmark.contestants import load_contestants
 from utopic_cli.benchmark.fpfh import Fpfh, dual_softmax
 from utopic_cli.benchmark.matcher import load_matchers
 from utopic_cli.config import AlignOptions
@@ -74,9 +75,17 @@ def test_weights_of_one_name_are_told_apart(tmp_path) -> None:
 
 
 def test_what_cant_be_measured_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"'magic'.*fpfh"):
-        load_matchers([], ["magic"], 0, "cpu")
+    with pytest.raises(UsageError, match=r"'magic'.*fpfh.*small-gicp"):
+        load_contestants([], ["magic"], 0, "cpu")
     with pytest.raises(UsageError, match="nothing to measure"):
-        load_matchers([], [], 0, "cpu")
+        load_contestants([], [], 0, "cpu")
     with pytest.raises(InputError, match="no bundled weights"):
         load_matchers(["nobody"], [], 0, "cpu")
+
+
+def test_features_and_whole_methods_are_told_apart() -> None:
+    pytest.importorskip("open3d")
+    found = load_contestants([], ["open3d-icp", "fpfh", "open3d-icp"], 0, "cpu")
+    assert [one.name for one in found.matchers] == ["fpfh"]
+    assert [one.name for one in found.methods] == ["open3d-icp"]
+    assert found.settings().keys() == {"fpfh", "open3d-icp"}

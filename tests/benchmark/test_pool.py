@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
 from functools import partial
 
@@ -53,3 +54,25 @@ def test_what_a_task_raises_is_raised_here():
 def test_a_dead_process_is_said_to_be_dead():
     with pytest.raises(RuntimeError, match="died"):
         each(make_death, 2, 1)
+
+
+def square(number, answer):
+    answer.put(number**2)
+
+
+def ask_a_child(number):
+    context = multiprocessing.get_context("spawn")
+    answer = context.SimpleQueue()
+    child = context.Process(target=square, args=(number, answer))
+    child.start()
+    found = answer.get()
+    child.join()
+    return found
+
+
+def make_parents():
+    return ask_a_child
+
+
+def test_tasks_may_have_processes_of_their_own():
+    assert each(make_parents, 2, 1) == [0, 1]

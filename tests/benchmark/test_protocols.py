@@ -1,14 +1,25 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from utopic_cli.benchmark.protocols import SCAN_BANDS, SCAN_REACH, CropProtocol, RangeProtocol
+from utopic_cli.benchmark.protocols import (
+    DETAIL_POINTS,
+    DETAIL_RELIEF,
+    SCAN_BANDS,
+    SCAN_REACH,
+    CropProtocol,
+    RangeProtocol,
+)
 from utopic_cli.errors import UsageError
 from utopic_cli.geometry.rigid import apply
 from utopic_cli.synthesis.pairs import evaluation_pairs
 from utopic_cli.synthesis.procedural import procedural_mesh
+from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.shapes import ShapeLibrary, pack
 from utopic_cli.training.labels import POSITIVE_REACH
 
@@ -83,3 +94,42 @@ def test_range_scans_lie_in_their_bands_in_equal_numbers(shapes: ShapeLibrary) -
 
 def test_overlap_means_the_same_as_in_training() -> None:
     assert SCAN_REACH == POSITIVE_REACH
+
+
+@pytest.mark.parametrize("sampling", ["shared", "independent"])
+def test_detail_takes_five_thousand_points_and_bends_them(shapes: ShapeLibrary, sampling: str) -> None:
+    plain = CropProtocol("detail", 0.7, sampling, "euler45", points=DETAIL_POINTS)
+    bent = replace(plain, relief=DETAIL_RELIEF)
+    for protocol in (plain, bent):
+        pair = protocol.pair(shapes, 0, 1)
+        assert len(pair.source) == len(pair.target) == 3500
+        assert (pair.shared is not None) == (sampling == "shared")
+        assert pair.object_points is not None
+        whole = apply(pair.gt_T_target_source, pair.object_points)
+        assert np.linalg.norm(whole, axis=1).max() == pytest.approx(1.0, abs=0.01)
+        # The clouds are noisy samples of that very surface.
+        distance = cKDTree(whole).query(pair.target.points)[0]
+        assert np.quantile(distance, 0.99) < 0.05
+    assert plain.settings()["relief"] == 0 and bent.settings()["relief"] == DETAIL_RELIEF
+    # Bending is all the difference: another surface, several per cent of the radius away.
+    surfaces = [
+        apply(pair.gt_T_target_source, pair.object_points)
+        for pair in (plain.pair(shapes, 0, 1), bent.pair(shapes, 0, 1))
+        if pair.object_points is not None
+    ]
+    assert np.median(cKDTree(surfaces[0]).query(surfaces[1])[0]) > 0.01
+
+
+def test_points_of_a_data_set_are_used_as_they_are(shapes: ShapeLibrary) -> None:
+    rng = np.random.default_rng(0)
+    given = rng.uniform(-0.5, 0.5, (3, 2048, 3)).astype(np.float16)
+    library = replace(shapes, samples=given)
+    protocol = CropProtocol("scanobjectnn", 0.7, "shared", "euler45")
+    pair = protocol.pair(library, 0, 0)
+    number = "abc".index(str(pair.shape))
+    assert len(pair.source) == len(pair.target) == 717
+    # The target stays in the object's frame under the paper's rotations: off by the jitter alone.
+    offset = np.abs(pair.target.points[:, None] - given[number][None].astype(float)).max(axis=2).min(axis=1)
+    assert offset.max() <= 0.05 + 1e-9
+    with pytest.raises(DegeneratePair, match=r"2048 points .* 10000 are needed"):
+        replace(protocol, points=DETAIL_POINTS).pair(library, 0, 0)

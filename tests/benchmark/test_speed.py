@@ -79,6 +79,7 @@ def test_the_report_is_told_in_tables_json_and_page() -> None:
     out = io.StringIO()
     render(report, Console(file=out, width=200))
     said = out.getvalue()
+    assert "REGTR (quoted)" in said and "0.29 / 0.23" in said and "RTX 2080 Ti" in said
     assert "0.50%" in said and "2/2" in said and "batch 4, cpu: left out" in said and "400" in said
     rows = json.loads(report.to_json())["measurements"]
     assert [row["pairs_per_second"] for row in rows] == [2.0, None, 0.5]

@@ -60,6 +60,13 @@ def test_the_ratio_to_the_floor_is_of_means() -> None:
     assert summary.floor_ratio_t == pytest.approx(2.0)
 
 
+def test_one_wild_failure_leaves_the_ratio_of_the_medians_alone() -> None:
+    floor = [answer(pair, 0.1, 0.001, FLOOR) for pair in range(3)]
+    summary = summarise([answer(0, 0.2), answer(1, 180.0), answer(2, 0.1)], floor)
+    assert summary.floor_ratio_r_median == pytest.approx(2.0)
+    assert summary.floor_ratio_r is not None and summary.floor_ratio_r > 100.0
+
+
 def test_what_nobody_knows_stays_unknown() -> None:
     told = OverlapMeasures(0.8, None, 0.5, 0.7)
     also = OverlapMeasures(0.6, 0.4, 0.7, 0.5)

@@ -8,6 +8,7 @@ import pytest
 from utopic_cli.benchmark import synthetic
 from utopic_cli.benchmark.protocols import CropProtocol, RangeProtocol
 from utopic_cli.benchmark.scans import Report
+from utopic_cli.commands.bench import PANELS
 from utopic_cli.config import AlignOptions
 from utopic_cli.synthesis.shapes import pack
 
@@ -87,6 +88,9 @@ def synthetic_run(monkeypatch):
         (["modelonet"], CropProtocol("modelonet", 0.5, "shared", "euler45")),
         (["modelnet", "--sampling", "independent"], CropProtocol("modelnet", 0.7, "independent", "uniform")),
         (["modelnet", "--rotations", "uniform"], CropProtocol("modelnet", 0.7, "shared", "uniform")),
+        (["detail"], CropProtocol("detail", 0.7, "shared", "euler45", 5000, 0.0)),
+        (["detail", "--relief"], CropProtocol("detail", 0.7, "shared", "euler45", 5000, 0.04)),
+        (["scanobjectnn"], CropProtocol("scanobjectnn", 0.7, "shared", "euler45")),
         (["range-scans"], RangeProtocol()),
     ],
 )
@@ -98,8 +102,9 @@ def test_each_protocol_is_a_command(cli, synthetic_run, tmp_path, arguments, pro
     assert result.exit_code == 0, result.output
     (call,) = synthetic_run
     assert call["protocol"] == protocol
+    data = "scanobjectnn:shapes" if protocol.name == "scanobjectnn" else "shapes"
     assert (call["data"], call["pairs"], call["seed"], call["workers"], call["points"], call["device"]) == (
-        "shapes", 4, 9, 2, 500, "cpu",
+        data, 4, 9, 2, 500, "cpu",
     )  # fmt: skip
     assert (call["weights"], call["baselines"]) == (["utopic", "b.safetensors"], [])
     assert json.loads((tmp_path / "r.json").read_text())["protocol"]["name"] == protocol.name
@@ -109,6 +114,51 @@ def test_each_protocol_is_a_command(cli, synthetic_run, tmp_path, arguments, pro
 def test_bundled_weights_are_measured_if_none_are_named(cli, synthetic_run):
     assert cli("bench", "range-scans").exit_code == 0
     assert (synthetic_run[0]["weights"], synthetic_run[0]["data"]) == (["utopic"], "procedural")
+
+
+def test_built_in_shapes_get_relief_for_detail_unless_told_not_to(cli, synthetic_run):
+    assert cli("bench", "detail").exit_code == 0
+    assert cli("bench", "detail", "--no-relief").exit_code == 0
+    assert [call["protocol"].relief for call in synthetic_run] == [0.04, 0.0]
+
+
+def test_scanobjectnn_without_its_file(cli, tmp_path):
+    assert cli("bench", "scanobjectnn").exit_code == 2
+    result = cli("bench", "scanobjectnn", "--data", tmp_path)
+    assert result.exit_code == 4 and len(result.stderr.splitlines()) == 1
+    assert "no test_objectdataset.h5" in result.stderr and "hkust-vgd" in result.stderr
+
+
+def test_modelnet40_without_its_files(cli, tmp_path):
+    result = cli("bench", "modelnet", "--data", f"modelnet40:{tmp_path}")
+    assert result.exit_code == 4 and len(result.stderr.splitlines()) == 1
+    assert "ply_data_test*.h5" in result.stderr and "modelnet40_ply_hdf5_2048.zip" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"source": "gone.ply", "target": "b.ply"}, "pairs[0]: its source 'gone.ply' is not a file"),
+        (
+            {"source": "a.ply", "target": "b.ply", "T_target_source": np.diag([2.0, 2, 2, 1]).tolist()},
+            "pairs[0] (a.ply -> b.ply): T_target_source is no rigid transformation",
+        ),
+    ],
+    ids=["missing scan", "scaled"],
+)
+def test_an_answer_that_cant_be_used_exits_4_and_is_named(cli, scans, entry, words):
+    folder = scans[0].parent
+    (folder / "gt.json").write_text(json.dumps({"pairs": [entry]}))
+    result = cli("bench", "scans", folder)
+    assert result.exit_code == 4 and len(result.stderr.splitlines()) == 1
+    assert f"{folder / 'gt.json'}: {words}" in result.stderr
+
+
+def test_every_protocol_has_its_place_in_the_help(cli):
+    said = cli("bench", "--help").stdout
+    for title, members in PANELS.items():
+        assert title in said
+        assert all(name in said for name in members)
 
 
 @pytest.mark.parametrize("name", ["modelnet", "modelonet", "range-scans"])

@@ -12,7 +12,7 @@ from tests.synthesis.test_shapes import write_packed
 from utopic_cli.errors import InputError, OutputError
 from utopic_cli.synthesis import packing
 from utopic_cli.synthesis.mesh_form import packed_mesh
-from utopic_cli.synthesis.packing import cache_folder, describe_skipped, open_shapes
+from utopic_cli.synthesis.packing import cache_folder, describe_data, describe_skipped, open_shapes
 from utopic_cli.synthesis.reconstruction import mesh_from_points
 from utopic_cli.synthesis.shapes import load_shapes
 from utopic_cli.synthesis.surface import DegenerateShape, face_areas, sample_surface
@@ -313,6 +313,67 @@ def test_modelnet40_elsewhere_or_damaged_is_an_input_error(modelnet40, tmp_path,
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match="pip install h5py"):
         open_shapes(f"modelnet40:{modelnet40}")
+
+
+# ScanObjectNN ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def scanobjectnn(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    rng = np.random.default_rng(0)
+    for folder, size in (("main_split", 4), ("main_split_nobg", 3)):
+        root = tmp_path / "h5_files" / folder
+        root.mkdir(parents=True)
+        clouds = [sample_surface(*cuboid((1, 2, 3)), 300, rng)[0] * 0.4 + [5.0, 0, 1] for _ in range(size)]
+        with h5py.File(root / "test_objectdataset.h5", "w") as file:
+            file["data"] = np.stack(clouds).astype(np.float32)
+            file["label"] = np.arange(size, dtype=np.uint8)
+            file["mask"] = np.full((size, 300), -1, np.int32)
+    return tmp_path
+
+
+def test_scanobjectnn_is_all_for_testing_and_in_the_unit_sphere(scanobjectnn):
+    split = scanobjectnn / "h5_files" / "main_split"
+    for path in (scanobjectnn, scanobjectnn / "h5_files", split, split / "test_objectdataset.h5"):
+        library = open_shapes(f"scanobjectnn:{path}")
+        assert library.splits.tolist() == ["test"] * 4
+    assert library.names[0] == "test_objectdataset/0000"
+    assert library.sets.tolist() == [f"category {label}" for label in range(4)]
+    assert library.samples is not None and library.samples.shape == (4, 300, 3)
+    reach = np.linalg.norm(library.samples.astype(float), axis=2).max(axis=1)
+    np.testing.assert_allclose(reach, 1.0, atol=2e-3)  # kept in half precision
+    assert len(library.mesh(0)[1]) > 300
+    assert len(open_shapes(f"scanobjectnn:{scanobjectnn / 'h5_files' / 'main_split_nobg'}")) == 3
+
+
+def test_scanobjectnn_elsewhere_or_damaged_is_an_input_error(scanobjectnn, tmp_path, monkeypatch):
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "empty").mkdir()
+    for missing in ("empty", "nothing"):
+        with pytest.raises(InputError, match=rf"{missing}: no test_objectdataset\.h5 here.*hkust-vgd"):
+            open_shapes(f"scanobjectnn:{tmp_path / missing}")
+    with pytest.raises(InputError, match="no such folder"):
+        open_shapes("scanobjectnn:")
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["points"] = np.zeros((2, 30, 3))
+    with pytest.raises(InputError, match=r"other\.h5: has no arrays 'data' and 'label'.*hkust-vgd"):
+        open_shapes(f"scanobjectnn:{other}")
+    with h5py.File(other, "w") as file:
+        file["data"], file["label"] = np.zeros((2, 30, 3)), np.zeros(2, int)
+    with pytest.raises(InputError, match=r"other\.h5: has a cloud that can't be used"):
+        open_shapes(f"scanobjectnn:{other}")
+    other.write_bytes(b"cut short")
+    with pytest.raises(InputError, match=r"other\.h5: can't be read as HDF5"):
+        open_shapes(f"scanobjectnn:{other}")
+
+
+def test_data_in_words():
+    assert describe_data("procedural") == "built-in procedural shapes"
+    assert describe_data("modelnet40:a/b") == "ModelNet40 in a/b"
+    assert describe_data("scanobjectnn:c.h5") == "ScanObjectNN in c.h5"
+    assert describe_data("shapes") == "shapes"
 
 
 # Real data ---------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -11,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from utopic_cli.benchmark.contestants import Contestants
 from utopic_cli.benchmark.matcher import Matcher
+from utopic_cli.benchmark.method import Method, Trial, checked, refined
+from utopic_cli.benchmark.metrics import pair_extent
 from utopic_cli.benchmark.pair_metrics import (
     KnownNodes,
     MatchMeasures,
@@ -23,6 +24,7 @@ from utopic_cli.benchmark.pair_metrics import (
     measure_pose,
 )
 from utopic_cli.benchmark.protocols import AnyProtocol
+from utopic_cli.benchmark.speed_clock import cpu_seconds_so_far
 from utopic_cli.benchmark.uncertainty import UncertaintyByPlace, measure_uncertainty
 from utopic_cli.bridge import NetworkView
 from utopic_cli.errors import InputError
@@ -49,19 +51,19 @@ class Answer:
         shape: name of the shape.
         overlap: overlap ratio of the smaller side.
         extent: of the whole object, in the points' unit.
-        method: name of the matcher, or ``floor``.
-        stage: ``solved`` (matches and one robust solve), ``refined`` (after refinement at full
-            resolution), or ``floor`` (Procrustes on the true correspondences).
+        method: name of the matcher or the method, or ``floor``.
+        stage: ``solved`` (matches and one robust solve, or the method's own answer), ``refined`` (after
+            refinement at full resolution), or ``floor`` (Procrustes on the true correspondences).
         gt_T_target_source: (4, 4) the known answer.
         T_target_source: (4, 4) the answer, or None.
         pose: how far it is off, or None.
-        matches: of the view that the answer rests on; None for the floor.
+        matches: of the view that the answer rests on; None for the floor and for methods.
         first_overlap: overlap told without a transformation; None from who tells none.
         final_overlap: overlap told when shown the answer (the pipeline's last look).
         first_uncertainty: raw uncertainty by place at the first look; None from who tells no overlap.
         final_uncertainty: the same when shown the answer.
         score: the solver's score of it.
-        cpu_seconds: by step: look, solve, refine, look_again.
+        cpu_seconds: by step: look, solve, refine, look_again; of a method: method, refine.
         message: what was raised where there is no answer.
     """
 
@@ -93,21 +95,24 @@ class Answer:
 
 
 def answer_pair(
-    pair: ScanPair, number: int, protocol: AnyProtocol, matchers: Sequence[Matcher], points: int
+    pair: ScanPair, number: int, protocol: AnyProtocol, contestants: Contestants, points: int, seed: int = 0
 ) -> list[Answer]:
-    """Ask every matcher for a transformation, and measure it before and after refinement.
+    """Ask everybody for a transformation, and measure it before and after refinement.
 
     Args:
         pair: with a sample of the whole object.
         number: of the pair in its protocol.
         protocol: says in which units errors are counted.
-        matchers: who is asked.
+        contestants: who is asked.
         points: most sampled points per cloud.
+        seed: of the draws of methods, together with ``number``.
     """
     desk = _Desk(pair, number, protocol, prepare(pair.source, pair.target, points, clean=protocol.cleans))
     answers = [] if pair.shared is None else [desk.floor(pair.shared)]
-    for matcher in matchers:
+    for matcher in contestants.matchers:
         answers += desk.ask(matcher)
+    for method in contestants.methods:
+        answers += desk.consult(method, seed)
     return answers
 
 
@@ -146,19 +151,47 @@ class _Desk:
                 look = look_both_sides(partial(_look, matcher, seconds), self._prepared)
             seconds["solve"] -= seconds["look"]
         except InputError as error:  # no transformation follows from the scores
-            return [
-                Answer(
-                    **self._about, method=matcher.name, stage=stage, cpu_seconds=seconds, message=str(error)
-                )
-                for stage in (SOLVED, REFINED)
-            ]
+            return self._lost(matcher.name, seconds, str(error))
         T = look.prepared.denormalise(look.estimate.T_target_source)
         refining = dict(seconds)
         with _cpu(refining, "refine"):
-            refined = refine(self._pair.source, self._pair.target, T).T_target_source
+            T_refined = refine(self._pair.source, self._pair.target, T).T_target_source
         return [
             self._answer(matcher, look, T, SOLVED, seconds),
-            self._answer(matcher, look, refined, REFINED, refining),
+            self._answer(matcher, look, T_refined, REFINED, refining),
+        ]
+
+    def consult(self, method: Method, seed: int) -> list[Answer]:
+        """Return the answers ``solved`` (the method's own) and ``refined`` of a whole method."""
+        source, target = self._pair.source, self._pair.target
+        own_seed = int(np.random.default_rng([seed, self._about["pair"], 2]).integers(2**31))
+        trial = Trial(source, target, pair_extent(source, target), own_seed)
+        seconds: dict[str, float] = {}
+        try:
+            with _cpu(seconds, "method"):
+                T = checked(method.estimate(trial))
+        except Exception as raised:  # whatever a method does wrong is a failure of that method
+            message = " ".join(f"{type(raised).__name__}: {raised}".splitlines())
+            return self._lost(method.name, seconds, message)
+        refining = dict(seconds)
+        with _cpu(refining, "refine"):
+            T_refined = refined(trial, T)
+        return [
+            Answer(
+                **self._about,
+                method=method.name,
+                stage=stage,
+                T_target_source=one,
+                pose=self._pose(one),
+                cpu_seconds=spent,
+            )
+            for stage, one, spent in ((SOLVED, T, seconds), (REFINED, T_refined, refining))
+        ]
+
+    def _lost(self, name: str, seconds: dict[str, float], message: str) -> list[Answer]:
+        return [
+            Answer(**self._about, method=name, stage=stage, cpu_seconds=seconds, message=message)
+            for stage in (SOLVED, REFINED)
         ]
 
     def _answer(
@@ -206,7 +239,9 @@ def _look(matcher: Matcher, seconds: dict[str, float], prepared: PreparedPair) -
 
 @contextmanager
 def _cpu(seconds: dict[str, float], step: str) -> Iterator[None]:
-    """Add the CPU time of the block, all threads of this process."""
-    begin = time.process_time()
-    yield
-    seconds[step] = seconds.get(step, 0.0) + time.process_time() - begin
+    """Add the CPU time of the block, of all threads and processes."""
+    begin = cpu_seconds_so_far()
+    try:
+        yield
+    finally:
+        seconds[step] = seconds.get(step, 0.0) + cpu_seconds_so_far() - begin

@@ -6,9 +6,12 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 WIDTH, HEIGHT = 420, 340
-LEFT, RIGHT, TOP, BOTTOM = 52, 20, 14, 44  # margins
+LEFT, RIGHT, TOP, BOTTOM = 52, 20, 14, 44  # margins; the left one is wider where its numbers are long
 STEPS = 5
+LETTER = 6.2  # widest of a number's, at the page's size of letters
 
 
 @dataclass
@@ -61,18 +64,33 @@ class Chart:
             grid.append(_text(x, HEIGHT - BOTTOM + 16, "middle", self.forms[0].format(across)))
             if self.forms[1]:
                 grid.append(_rule((self._x(0.0), y), (self._x(self.most[0]), y)))
-                grid.append(_text(LEFT - 7, y + 4, "end", self.forms[1].format(up)))
+                grid.append(_text(self._left - 7, y + 4, "end", self.forms[1].format(up)))
         middle = (TOP + HEIGHT - BOTTOM) / 2
-        grid.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, "middle", self.across))
+        grid.append(_text((self._left + WIDTH - RIGHT) / 2, HEIGHT - 8, "middle", self.across))
         grid.append(f'<g transform="rotate(-90 13 {middle})">{_text(13, middle, "middle", self.up)}</g>')
         head = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(self.title)}">'
         return "".join([head, *grid, *self._marks, "</svg>"])
 
+    @property
+    def _left(self) -> float:
+        numbers = [self.forms[1].format(self.most[1] * step / STEPS) for step in range(STEPS + 1)]
+        return max(LEFT, 26 + LETTER * max(map(len, numbers)))
+
     def _x(self, value: float) -> float:
-        return LEFT + min(value / self.most[0], 1.0) * (WIDTH - LEFT - RIGHT)
+        return self._left + min(value / self.most[0], 1.0) * (WIDTH - self._left - RIGHT)
 
     def _y(self, value: float) -> float:
         return HEIGHT - BOTTOM - min(value / self.most[1], 1.0) * (HEIGHT - TOP - BOTTOM)
+
+
+def round_up(value: float) -> float:
+    """Return the least end of an axis from 0, at or above ``value``, whose steps are round numbers."""
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value / STEPS))
+    steps = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0, 10.0)
+    step = next(step for step in steps if step * power * STEPS >= value * (1.0 - 1e-9))
+    return float(step * power * STEPS)
 
 
 def _text(x: float, y: float, anchor: str, text: str) -> str:

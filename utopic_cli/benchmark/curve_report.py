@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from utopic_cli.benchmark.answers import FLOOR, REFINED, Answer
 from utopic_cli.benchmark.pair_metrics import SUCCESS
@@ -73,12 +73,19 @@ def _step(answer: Answer) -> int:
     return min(int(answer.overlap / OVERLAP_STEP + 1e-9), round(1.0 / OVERLAP_STEP) - 1)
 
 
+def _levels(protocol: dict[str, Any]) -> str:
+    """Say what the levels are, and what the paper says of them."""
+    quoted = protocol.get("quoted_overlaps")
+    said = f"; quoted overlaps: about {', '.join(map(str, quoted))}" if quoted else ""
+    return f"{protocol['level_means']}{said}"
+
+
 def _by_level(report: CurveReport) -> Table:
     protocol = report.settings["protocol"]
     degrees, length = SUCCESS
     table = make_table(
         report.title,
-        f"{protocol['level_means']}; success: under {degrees:g} degrees and {length:g} "
+        f"{_levels(protocol)}; success: under {degrees:g} degrees and {length:g} "
         f"({protocol['length_unit']}), translations compared {protocol['translation_error']}; or symmetric: "
         "or the object lies within 2 % of its extent of its place; medians of all answers; "
         "[95 % Wilson interval]",

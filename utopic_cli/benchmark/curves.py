@@ -34,8 +34,15 @@ SHIFT = 0.5
 FAR = 500.0
 """Distance of PRNet's viewpoints, in radii."""
 
+ASIDE = 75.0
+"""Degrees that the target's viewpoint is at most away from opposite the source's: so wide that the mean
+overlaps are the paper's."""
+
 KEPT = (768, 700, 640, 600, 560)
 """Points that both crops of the overlap sweep keep of 1,024."""
+
+QUOTED_OVERLAPS = (0.69, 0.58, 0.47, 0.40, 0.32)
+"""The paper's approximate overlaps at these."""
 
 CLEAN = replace(
     PairSettings(),
@@ -199,9 +206,9 @@ class SweepProtocol(CropProtocol):
     """``overlap-sweep``: PRNet's crops, keeping fewer and fewer of 1,024 points.
 
     Each cloud keeps the points nearest to a far viewpoint; the target's is drawn uniformly from the
-    half of all directions that face away from the source's, so that the overlap shrinks with what is kept.
-    Otherwise as ``modelnet``. A pair's overlap is the share of a crop's points that the other crop
-    has too; of independent samples it is measured between the clouds.
+    directions up to ``ASIDE`` degrees from opposite the source's. Otherwise as ``modelnet``. A pair's
+    overlap is the share of a crop's points that the other crop has too; of independent samples it is
+    measured between the clouds.
     """
 
     name: str = "overlap-sweep"
@@ -218,7 +225,13 @@ class SweepProtocol(CropProtocol):
         """Return the definition, JSON-ready."""
         definition = super().settings()
         del definition["keep"]
-        return {**definition, "levels": list(KEPT), "level_means": f"points kept of {POINTS}"}
+        return {
+            **definition,
+            "levels": list(KEPT),
+            "level_means": f"points kept of {POINTS}",
+            "viewpoints_from_opposite_deg": ASIDE,
+            "quoted_overlaps": list(QUOTED_OVERLAPS),
+        }
 
     def pair(self, library: ShapeLibrary, seed: int, number: int) -> ScanPair:
         """Make pair ``number`` of the test set ``seed``.
@@ -236,17 +249,18 @@ class SweepProtocol(CropProtocol):
 
 
 def cropped(pair: ScanPair, count: int, rng: np.random.Generator) -> ScanPair:
-    """Keep the ``count`` points of both clouds nearest to far viewpoints, on opposite sides.
+    """Keep the ``count`` points of both clouds nearest to far viewpoints, about on opposite sides.
 
     Args:
         pair: two whole clouds of an object of radius about 1.
         count: at most the points of either.
         rng: draws the viewpoints; the same state gives the same ones for any count.
     """
-    views = rng.standard_normal((2, 3))
-    views /= np.linalg.norm(views, axis=1, keepdims=True)
-    if views[0] @ views[1] > 0:
-        views[1] = -views[1]
+    first, across = rng.standard_normal((2, 3))
+    first /= np.linalg.norm(first)
+    across -= (across @ first) * first
+    along = rng.uniform(np.cos(np.radians(ASIDE)), 1.0)  # uniform over the cap
+    views = np.stack([first, np.sqrt(1.0 - along**2) * across / np.linalg.norm(across) - along * first])
     back = rigid.invert(pair.gt_T_target_source)  # viewpoints are drawn in the target's frame
     kept = [
         nearest_crop(pair.source.points, rigid.apply(back, FAR * views[:1])[0], count),

@@ -14,7 +14,6 @@ import numpy as np
 
 from utopic_cli.benchmark.method import Trial
 from utopic_cli.errors import UsageError
-from utopic_cli.estimation.surface import point_spacing
 from utopic_cli.geometry.rigid import rigid
 
 Answer = tuple[np.ndarray, np.ndarray]
@@ -68,9 +67,7 @@ class KissMatcher:
             RuntimeError: it found no transformation, crashed, or took too long.
         """
         library = load_kiss_matcher()
-        spacing = max(point_spacing(cloud.points) for cloud in (trial.source, trial.target))
-        voxel = max(trial.extent / self.voxels_per_extent, self.spacings_per_voxel * spacing)
-        per_unit = self.voxel_size / voxel
+        per_unit = self.voxel_size / trial.voxel(self.voxels_per_extent, self.spacings_per_voxel)
         source_centre, target_centre = (cloud.points.mean(axis=0) for cloud in (trial.source, trial.target))
         source, target = (
             ((cloud.points - centre) * per_unit).astype(np.float32)  # all that it takes

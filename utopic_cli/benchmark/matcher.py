@@ -8,14 +8,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from utopic_cli.benchmark.baselines import load_open3d
 from utopic_cli.benchmark.fpfh import Fpfh
+from utopic_cli.benchmark.open3d_methods import load_open3d
 from utopic_cli.bridge import NetworkView, load_network, predict
-from utopic_cli.errors import UsageError
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.preprocess import PreparedPair
 
-BASELINES = ("fpfh",)
+FEATURES = ("fpfh",)
+"""Hand-made features that can take the network's place."""
 
 
 class Matcher(Protocol):
@@ -83,41 +83,27 @@ class Network:
 
 
 def load_matchers(
-    weights: Sequence[str], baselines: Sequence[str], seed: int, device: str
+    weights: Sequence[str], features: Sequence[str], seed: int, device: str
 ) -> tuple[Matcher, ...]:
-    """Load what is to be measured, the networks first.
+    """Load matchers, the networks first.
 
     Args:
         weights: bundled names or paths; a weights file whose name is taken is called by its path.
-        baselines: names; ``fpfh`` is known.
+        features: names from ``FEATURES``.
         seed: of the networks' overlap samples.
         device: auto, cpu, cuda or mps.
 
     Raises:
         InputError: weights or device can't be used.
-        UsageError: nothing to measure, an unknown baseline (the known ones are listed), or no Open3D.
+        UsageError: no Open3D.
     """
-    check_baselines(baselines)
-    if not weights and not baselines:
-        raise UsageError("nothing to measure: name weights or a baseline")
+    if features:
+        load_open3d()
     found: list[Matcher] = []
     for one in dict.fromkeys(weights):
         model, card = load_network(one, device)
         taken = {matcher.name for matcher in found}
         name = one if card["name"] in taken else card["name"]
         found.append(Network(name, model, card, seed, model.config.overlap))
-    found += [Fpfh() for _ in dict.fromkeys(baselines)]
+    found += [Fpfh() for _ in dict.fromkeys(features)]
     return tuple(found)
-
-
-def check_baselines(names: Sequence[str]) -> None:
-    """Make sure, before any work, that baselines are known and can run.
-
-    Raises:
-        UsageError: see ``load_matchers``.
-    """
-    for name in names:
-        if name not in BASELINES:
-            raise UsageError(f"unknown baseline {name!r}; this protocol knows: {', '.join(BASELINES)}")
-    if names:
-        load_open3d()

@@ -6,16 +6,28 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from utopic_cli.config import AlignOptions
+from utopic_cli.estimation.refinement import refine
+from utopic_cli.estimation.surface import point_spacing
+from utopic_cli.geometry.rigid import nearest_rotation, rigid
 from utopic_cli.io.scan import Scan
 from utopic_cli.io.transformation import read_transformation
 from utopic_cli.point_cloud import PointCloud
+
+IDENTITY = "identity"
+"""Value of the setting ``start`` of a method that starts from where the scans lie."""
+
+LOCAL_REACH = (10.0, 3.0, 1.0)
+"""Reach of the rounds of such methods, in voxels: 20, 6 and 2 % of the extent of dense scans."""
+
+NOTHING_NEAR = "no correspondence within reach of where the scans lie"
 
 
 @dataclass(frozen=True)
@@ -29,17 +41,26 @@ class Trial:
             methods that must be told a length.
         seed: seed of the method's own random draws.
         start: (4, 4) what brought the source from its file into the start pose.
-        source_scan: the file the source was read from.
-        target_scan: the file the target was read from.
+        source_scan: the file the source was read from; None of scans that were simulated.
+        target_scan: the file the target was read from; None likewise.
     """
 
     source: PointCloud
     target: PointCloud
     extent: float
     seed: int
-    start: np.ndarray
-    source_scan: Scan
-    target_scan: Scan
+    start: np.ndarray = field(default_factory=lambda: np.eye(4))
+    source_scan: Scan | None = None
+    target_scan: Scan | None = None
+
+    def voxel(self, voxels_per_extent: float, spacings_per_voxel: float) -> float:
+        """Return the length a method that asks for one is given.
+
+        It is the extent divided by the first number, but at least the second times the spacing of the
+        sparser scan's points: below that there is nothing to see.
+        """
+        spacing = max(point_spacing(cloud.points) for cloud in (self.source, self.target))
+        return max(self.extent / voxels_per_extent, spacings_per_voxel * spacing)
 
 
 class Method(Protocol):
@@ -66,6 +87,34 @@ class Method(Protocol):
     def estimate(self, trial: Trial) -> np.ndarray:
         """Return T_target_source, (4, 4) float64; any exception is a failure on this trial."""
         ...
+
+
+def checked(transformation: np.ndarray) -> np.ndarray:
+    """Return a method's estimate with its rotation made exact, (4, 4) float64.
+
+    Raises:
+        ValueError: it is no finite (4, 4) matrix.
+    """
+    if np.shape(transformation) != (4, 4) or not np.isfinite(transformation).all():
+        raise ValueError("the estimate is no finite 4x4 matrix")
+    return rigid(nearest_rotation(transformation[:3, :3]), transformation[:3, 3])
+
+
+def refined(trial: Trial, estimate: np.ndarray) -> np.ndarray:
+    """Give an estimate the refinement at full resolution that ``utopic`` ends with, (4, 4)."""
+    return refine(trial.source, trial.target, estimate).T_target_source
+
+
+def remarks(methods: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Say what must be known of methods to read their figures.
+
+    Args:
+        methods: settings by name, as a report has them.
+    """
+    local = [name for name, settings in methods.items() if settings.get("start") == IDENTITY]
+    if not local:
+        return []
+    return [f"{', '.join(local)}: local; started from the identity, that is where the scans lie"]
 
 
 @dataclass(frozen=True)
@@ -116,7 +165,10 @@ class UtopicCommand:
 
         Raises:
             RuntimeError: it ended with another exit code than 0; carries the last line it wrote.
+            ValueError: the trial has no files.
         """
+        if trial.source_scan is None or trial.target_scan is None:
+            raise ValueError("there are no files to run the command on")
         with tempfile.TemporaryDirectory(prefix="utopic-bench-") as folder:
             source = Path(folder, f"source{trial.source_scan.path.suffix}")
             source.write_bytes(trial.source_scan.moved(trial.start))

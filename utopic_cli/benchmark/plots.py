@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from utopic_cli.benchmark.chart import Chart
+from utopic_cli.benchmark.chart import Chart, round_up
 from utopic_cli.benchmark.synthetic_summary import Share
 from utopic_cli.benchmark.trust_report import share
 from utopic_cli.benchmark.web import figure
 
-LOOKS = 6
+LOOKS = 8
 MOST_DEGREES = 10.0
 """End of the axis of the recall plot."""
 
@@ -55,7 +55,7 @@ def value_plot(
     forms: tuple[str, str] = ("{:.1f}", "{:.2g}"),
     ceiling: float = np.inf,
 ) -> str:
-    """Draw values; the upward axis ends a little above the largest, or at the ceiling.
+    """Draw values; the upward axis ends at a round number above the largest, or at the ceiling.
 
     Args:
         name: of the figure.
@@ -67,7 +67,7 @@ def value_plot(
         ceiling: what lies above is drawn there.
     """
     top = max((value for points in series.values() for _, value in points), default=0.0)
-    chart = Chart(name, *axes, (most, min(1.05 * top or 1.0, ceiling)), forms)
+    chart = Chart(name, *axes, (most, min(round_up(top), ceiling)), forms)
     for look, (one, points) in zip(_looks(), series.items()):
         chart.line(points, f"series {look}")
         for place, value in points:

@@ -52,7 +52,8 @@ def each(
         with _one_thread():
             for _ in range(min(workers, count)):
                 mine, theirs = context.Pipe()
-                process: BaseProcess = context.Process(target=_serve, args=(theirs, make_task), daemon=True)
+                # No daemon: those may not have processes of their own, which some methods need.
+                process: BaseProcess = context.Process(target=_serve, args=(theirs, make_task))
                 process.start()
                 theirs.close()  # so that the end of the process is the end of the pipe
                 processes.append(process)

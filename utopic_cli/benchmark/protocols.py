@@ -18,8 +18,13 @@ from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.settings import Range
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.synthesis.surface import DegenerateShape
+from utopic_cli.synthesis.warp import random_warp
 
 POINTS = 1024
+DETAIL_POINTS = 5000
+DETAIL_RELIEF = 0.04
+"""Amplitude over wavelength of the relief that plain shapes get under ``detail``."""
+
 NOISE, CLIP = 0.01, 0.05
 CROP_RADIUS = 0.075
 """The paper's r: points of two sparse clouds nearer than this overlap (radius of the object 1)."""
@@ -84,25 +89,29 @@ class AnyProtocol(Protocol):
 
 @dataclass(frozen=True)
 class CropProtocol:
-    """``modelnet`` and ``modelonet``: the paper's (Sec. 4.1) half-space crops of 1,024 points.
+    """The paper's (Sec. 4.1) half-space crops: ``modelnet``, ``modelonet``, ``scanobjectnn``, ``detail``.
 
     Each shape is scaled to the unit sphere, sampled, cropped on both sides by a half-space of random
     direction, disturbed by noise and moved. Shapes take turns in a seeded random order. Of a library
-    that gives points (ModelNet40) these are used, in their own scale.
+    that gives points (ModelNet40, ScanObjectNN) these are used, in their own scale.
 
     Attributes:
-        name: ``modelnet`` or ``modelonet``.
-        keep: share of the points that each crop keeps (0.7 and 0.5).
+        name: of the command.
+        keep: share of the points that each crop keeps (0.7; ``modelonet``: 0.5).
         sampling: ``shared`` (one sample, both clouds are crops of it: the paper's figures) or
             ``independent`` (two samples of one surface, as scanners make).
         rotations: ``euler45`` (each Euler angle uniform in 0 to 45 degrees, translation within 0.5:
             the paper's) or ``uniform`` over SO(3) for both clouds.
+        points: sampled of each shape, before the crops.
+        relief: strength of the relief that each shape gets (see ``random_warp``); 0: none.
     """
 
     name: str
     keep: float
     sampling: str
     rotations: str
+    points: int = POINTS
+    relief: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse unknown names.
@@ -129,7 +138,6 @@ class CropProtocol:
         compared = "of the vectors" if self.rotations == "euler45" else "at the source's centroid"
         return {
             **asdict(self),
-            "points": POINTS,
             "noise": NOISE,
             "noise_clip": CLIP,
             "overlap_radius": CROP_RADIUS,
@@ -154,11 +162,12 @@ class CropProtocol:
                     rng,
                     self.sampling,
                     self.keep,
-                    count=POINTS,
+                    count=self.points,
                     noise=NOISE,
                     clip=CLIP,
                     rotations=self.rotations,
                     sample=None if library.samples is None else library.samples[shape],
+                    relief=random_warp(rng, strength=self.relief) if self.relief else None,
                     whole=True,
                 )
             except DegenerateShape as error:

@@ -15,22 +15,23 @@ from utopic_cli.benchmark.scans_report import Report as ScansReport
 from utopic_cli.benchmark.speed_report import SpeedReport
 from utopic_cli.benchmark.synthetic_report import Report
 from utopic_cli.benchmark.synthetic_summary import Share, wilson
+from utopic_cli.benchmark.variant_report import VariantReport
 from utopic_cli.benchmark.web import document, printed_table
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
-AnyReport = Report | ScansReport | SpeedReport
+AnyReport = Report | ScansReport | SpeedReport | VariantReport
 
 
 def page(report: AnyReport) -> str:
-    """Draw what a protocol on synthetic pairs, ``scans`` or ``speed`` found.
+    """Draw what a protocol on synthetic pairs or with variants, ``scans`` or ``speed`` found.
 
     Returns:
         One HTML page that loads nothing from elsewhere and runs no script.
     """
-    if isinstance(report, SpeedReport):
+    if isinstance(report, SpeedReport | VariantReport):
         figures = report.figures()
     elif isinstance(report, ScansReport):
         figures = _scans_figures(report)

@@ -21,7 +21,6 @@ and ``report.to_json()`` is the text of the JSON file.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -31,7 +30,7 @@ import numpy as np
 
 from utopic_cli.benchmark.baselines import find_baselines
 from utopic_cli.benchmark.ground_truth import KnownPair, measured_overlap, read_ground_truth
-from utopic_cli.benchmark.method import Method, Trial, Utopic, UtopicCommand
+from utopic_cli.benchmark.method import Method, Trial, Utopic, UtopicCommand, checked, refined
 from utopic_cli.benchmark.metrics import (
     MAX_RRE_DEG,
     MAX_RTE_SHARE,
@@ -39,10 +38,11 @@ from utopic_cli.benchmark.metrics import (
     pose_error,
 )
 from utopic_cli.benchmark.scans_report import SCHEMA_VERSION, Attempt, Report, render
+from utopic_cli.benchmark.speed_clock import cpu_seconds_so_far
 from utopic_cli.benchmark.versions import versions
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
-from utopic_cli.geometry.rigid import invert, nearest_rotation, random_rotation, rigid
+from utopic_cli.geometry.rigid import invert, random_rotation, rigid
 from utopic_cli.io.scan import Scan, read_scan
 
 __all__ = ["Attempt", "Report", "render", "run", "run_methods", "start_transformation"]
@@ -195,14 +195,14 @@ def _attempt(
 ) -> Attempt:
     gt = pair.gt_T_target_source @ invert(trial.start)
     estimate, error, message = None, None, None
-    begin, cpu_begin = time.perf_counter(), _cpu_seconds()
+    begin, cpu_begin = time.perf_counter(), cpu_seconds_so_far()
     try:
-        estimate = _checked(method.estimate(trial))
+        estimate = checked(method.estimate(trial))
         if refine and not method.refines:
-            estimate = _refined(trial, estimate)
+            estimate = refined(trial, estimate)
     except Exception as raised:  # whatever a method does wrong is a failure of that method
         estimate, message = None, " ".join(f"{type(raised).__name__}: {raised}".splitlines())
-    seconds, cpu_seconds = time.perf_counter() - begin, _cpu_seconds() - cpu_begin
+    seconds, cpu_seconds = time.perf_counter() - begin, cpu_seconds_so_far() - cpu_begin
     if estimate is not None:
         error = pose_error(estimate, gt, trial.source.points.mean(axis=0), trial.extent)
     return Attempt(
@@ -220,21 +220,3 @@ def _attempt(
         cpu_seconds=cpu_seconds,
         message=message,
     )
-
-
-def _cpu_seconds() -> float:
-    """CPU time so far of this process, all its threads, and the processes it has waited for."""
-    return sum(os.times()[:4])
-
-
-def _checked(transformation: np.ndarray) -> np.ndarray:
-    if np.shape(transformation) != (4, 4) or not np.isfinite(transformation).all():
-        raise ValueError("the estimate is no finite 4x4 matrix")
-    return transformation
-
-
-def _refined(trial: Trial, estimate: np.ndarray) -> np.ndarray:
-    from utopic_cli.estimation.refinement import refine
-
-    exact = rigid(nearest_rotation(estimate[:3, :3]), estimate[:3, 3])
-    return refine(trial.source, trial.target, exact).T_target_source

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from utopic_cli.benchmark.method import remarks
 from utopic_cli.benchmark.metrics import (
     MAX_RRE_DEG,
     MAX_RTE_SHARE,
@@ -127,9 +128,9 @@ class Report:
         return [_by_band(self)]
 
     def losses(self) -> list[str]:
-        """Say which exceptions ended attempts, and how many: one line for each."""
+        """Say what must be known of methods, and which exceptions ended how many attempts, by lines."""
         messages = [(attempt.method, attempt.message) for attempt in self.attempts if attempt.message]
-        return [
+        return remarks(self.settings.get("methods", {})) + [
             f"{method} failed {messages.count((method, message))} times with {message}"
             for method, message in sorted(set(messages))
         ]

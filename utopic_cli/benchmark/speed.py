@@ -14,12 +14,14 @@ has held there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
 
 from utopic_cli.benchmark.baselines import find_baselines
 from utopic_cli.benchmark.curves import BAND, CLEAN, SCAN_POINTS
+from utopic_cli.benchmark.method import Trial, checked, refined
 from utopic_cli.benchmark.metrics import pair_extent, pose_error
 from utopic_cli.benchmark.pool import each
 from utopic_cli.benchmark.speed_clock import Peak, Stopwatch, available_memory
@@ -30,7 +32,6 @@ from utopic_cli.bridge import load_network, predict, to_cloud_input
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.correspondences import linear_assignment
-from utopic_cli.estimation.refinement import refine
 from utopic_cli.model.cloud_input import stack_clouds
 from utopic_cli.pipeline import FEWEST_NODES, register
 from utopic_cli.preprocess import prepare
@@ -231,26 +232,14 @@ def _align(pairs: list[ScanPair], weights: str, seed: int, case: Measurement) ->
 
 
 def _baseline(pairs: list[ScanPair], seed: int, case: Measurement) -> Measurement:
-    from typing import cast
-
-    from utopic_cli.benchmark.method import Trial
-    from utopic_cli.io.scan import Scan
-
     (method,) = find_baselines([case.what])
     watch, peak = Stopwatch(), Peak()
     answers: list[np.ndarray | None] = []
     for pair in [pairs[0], *pairs]:
-        no_file = cast(Scan, None)  # baselines look at clouds and never at files
-        extent = pair_extent(pair.source, pair.target)
-        trial = Trial(pair.source, pair.target, extent, seed, np.eye(4), no_file, no_file)
+        trial = Trial(pair.source, pair.target, pair_extent(pair.source, pair.target), seed)
         answer = None
-        with watch.lap():
-            try:
-                answer = method.estimate(trial)
-            except Exception:  # a method that raises has failed on this pair, and its time counts
-                pass
-            else:
-                answer = refine(pair.source, pair.target, answer).T_target_source
+        with watch.lap(), suppress(Exception):  # who raises has failed on this pair, and its time counts
+            answer = refined(trial, checked(method.estimate(trial)))
         answers.append(answer)
     return case.measured(watch, peak).with_answers(None, _right(pairs, answers[1:]), None, {})
 

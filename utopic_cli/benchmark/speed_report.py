@@ -6,9 +6,12 @@ import json
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from utopic_cli.benchmark.method import remarks
 from utopic_cli.benchmark.plots import value_plot
+from utopic_cli.benchmark.quoted import SECONDS, TIMED_ON
 from utopic_cli.benchmark.speed_clock import Peak, Stopwatch
 from utopic_cli.benchmark.trust_report import number
+from utopic_cli.synthesis.packing import describe_data
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -102,8 +105,8 @@ class SpeedReport:
         """Protocol and data in one line."""
         return (
             f"speed: {self.settings['weights']}, {self.settings['pairs']} pairs of "
-            f"{self.settings['shapes']} '{self.settings['split']}' shapes, {self.settings['data']}, "
-            f"seed {self.settings['seed']}"
+            f"{self.settings['shapes']} '{self.settings['split']}' shapes, "
+            f"{describe_data(self.settings['data'])}, seed {self.settings['seed']}"
         )
 
     def tables(self) -> list[Table]:
@@ -111,8 +114,8 @@ class SpeedReport:
         return [_forwards(self), _alignments(self)]
 
     def losses(self) -> list[str]:
-        """Say which cases have no measurement, and why."""
-        return [
+        """Say what must be known of methods, and which cases have no measurement, and why."""
+        return remarks(self.settings.get("methods", {})) + [
             f"{one.what}, {one.points} points, batch {one.batch}, {one.device}: {one.message}"
             for one in self.measurements
             if one.message
@@ -145,7 +148,9 @@ class SpeedReport:
             }
             for one in self.measurements
         ]
-        return json.dumps({**self.settings, "measurements": rows}, indent=2, allow_nan=False) + "\n"
+        quoted = {"on": TIMED_ON, "seconds_by_points": SECONDS}
+        content = {**self.settings, "quoted": quoted, "measurements": rows}
+        return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
 def render(report: SpeedReport, console: Console) -> None:
@@ -185,7 +190,8 @@ def _alignments(report: SpeedReport) -> Table:
     table = _table(
         "Whole alignments",
         "without reading and writing files; right: under 5 degrees and under 5 % of the extent; linear "
-        "assignment: one, timed by itself, and its share of the whole",
+        "assignment: one, timed by itself, and its share of the whole; quoted: from the paper, on "
+        "other pairs and another machine",
         (
             "method",
             "points",
@@ -213,6 +219,14 @@ def _alignments(report: SpeedReport) -> Table:
                 _megabytes(one.peak_bytes),
                 _megabytes(one.idle_bytes),
             )
+    table.add_section()
+    for name, seconds in SECONDS.items():
+        table.add_row(
+            f"{name} (quoted)",
+            " / ".join(map(str, seconds)),
+            TIMED_ON,
+            " / ".join(f"{second:.2f}" for second in seconds.values()),
+        )
     return table
 
 

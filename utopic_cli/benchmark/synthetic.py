@@ -1,8 +1,8 @@
 """Protocols on synthetic pairs: ``modelnet``, ``modelonet``, ``range-scans``, and the curves.
 
-Definitions: ``protocols``, ``curves``. Every method meets the same pairs in the same run, its matches go into
-the same robust solve, and the answer is measured twice: as solved (no refinement), and after
-refinement at full resolution.
+Definitions: ``protocols``, ``curves``. Everybody meets the same pairs in the same run. The matches of
+networks and hand-made features go into the same robust solve; whole methods answer by themselves. Each
+answer is measured twice: as solved (no refinement), and after the same refinement at full resolution.
 
 For commands: ``report = run(protocol, shapes, ...)``, then ``render(report, console)`` prints the
 tables and ``report.to_json()`` is the text of the JSON file.
@@ -15,8 +15,8 @@ from functools import partial
 from typing import Any
 
 from utopic_cli.benchmark.answers import Answer, answer_pair
+from utopic_cli.benchmark.contestants import Contestants, load_contestants
 from utopic_cli.benchmark.curve_report import CurveReport
-from utopic_cli.benchmark.matcher import Matcher, load_matchers
 from utopic_cli.benchmark.pool import each
 from utopic_cli.benchmark.protocols import AnyProtocol
 from utopic_cli.benchmark.synthetic_report import SCHEMA_VERSION, Report, render
@@ -63,7 +63,7 @@ def run(
         pairs: how many pairs in all.
         seed: of the pairs and of the networks' own draws.
         weights: bundled names or paths.
-        baselines: names from ``matcher.BASELINES``.
+        baselines: names from ``contestants.KNOWN``.
         workers: processes, each with one thread; the results do not depend on their number.
         points: most sampled points per cloud.
         device: of the networks.
@@ -76,7 +76,7 @@ def run(
     if pairs < 1 or workers < 1 or seed < 0:
         raise UsageError("pairs and workers must be at least 1, and the seed not negative")
     test, split = held_out(shapes)
-    load = partial(load_matchers, tuple(weights), tuple(baselines), seed, device)
+    load = partial(load_contestants, tuple(weights), tuple(baselines), seed, device)
     settings: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "protocol": protocol.settings(),
@@ -88,7 +88,7 @@ def run(
         "points": points,
         "workers": workers,
         # Loaded here once, so that what can't be used ends the run before any work.
-        "methods": {matcher.name: matcher.settings() for matcher in load()},
+        "methods": load().settings(),
         "versions": versions(),
     }
 
@@ -107,7 +107,7 @@ def _task(
     data: str,
     seed: int,
     points: int,
-    load: Callable[[], tuple[Matcher, ...]],
+    load: Callable[[], Contestants],
 ) -> Callable[[int], list[Answer]]:
     """What a worker does once, before it answers pairs by number."""
     return partial(answers_to, protocol, shapes, data, seed, points, load())
@@ -119,10 +119,10 @@ def answers_to(
     data: str,
     seed: int,
     points: int,
-    matchers: tuple[Matcher, ...],
+    contestants: Contestants,
     number: int,
 ) -> list[Answer]:
-    """Make pair ``number`` and let every matcher answer it; arguments as for ``run``.
+    """Make pair ``number`` and let everybody answer it; arguments as for ``run``.
 
     Raises:
         InputError: no such pair can be made of the shapes.
@@ -131,4 +131,4 @@ def answers_to(
         pair = protocol.pair(shapes, seed, number)
     except DegeneratePair as error:
         raise InputError(f"{data}: {error}; give more or other shapes") from error
-    return answer_pair(pair, number, protocol, matchers, points)
+    return answer_pair(pair, number, protocol, contestants, points, seed)

@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from utopic_cli.benchmark.answers import FLOOR, REFINED, SOLVED, Answer
-from utopic_cli.benchmark.quoted import METRICS, QUOTED
+from utopic_cli.benchmark.method import remarks
+from utopic_cli.benchmark.quoted import DATA, METRICS, OVERLAP_ACCURACY, QUOTED
 from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Share, Summary, summarise
 from utopic_cli.benchmark.uncertainty import UncertaintySummary, summarise_uncertainty
+from utopic_cli.synthesis.packing import describe_data
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,9 +40,14 @@ class Report:
         protocol = self.settings["protocol"]
         how = [f"{protocol[key]}" for key in ("sampling", "rotations") if key in protocol]
         name = f"{protocol['name']} ({', '.join(how)})" if how else protocol["name"]
+        data = describe_data(self.settings["data"])
+        if not self.settings["data"].startswith(DATA.get(protocol["name"], "")):
+            data += " (not the paper's data)"
+        if protocol.get("relief"):
+            data += " with relief added"
         return (
             f"{name}: {self.settings['pairs']} pairs of {self.settings['shapes']} '{self.settings['split']}' "
-            f"shapes, {self.settings['data']}, seed {self.settings['seed']}"
+            f"shapes, {data}, seed {self.settings['seed']}"
         )
 
     def summaries(self) -> dict[tuple[str, str, str], Summary]:
@@ -81,11 +88,13 @@ class Report:
         return tables
 
     def losses(self) -> list[str]:
-        """Say how often, and why, there was no answer: one line for each reason."""
-        lost = [(answer.method, answer.message) for answer in self.answers if answer.message]
-        return [
-            f"{method}: no answer {lost.count((method, message))} times: {message}"
-            for method, message in sorted(set(lost))
+        """Say what must be known of methods, and how often and why there was no answer, by lines."""
+        # A pair without an answer has none at any stage.
+        lost = {(answer.method, answer.message, answer.pair) for answer in self.answers if answer.message}
+        reasons = [(method, message) for method, message, _ in lost]
+        return remarks(self.settings.get("methods", {})) + [
+            f"{method}: no answer to {reasons.count((method, message))} of the pairs: {message}"
+            for method, message in sorted(set(reasons))
         ]
 
     def to_json(self) -> str:
@@ -98,7 +107,12 @@ class Report:
             {"method": method, "look": look, **asdict(summary)}
             for (method, look), summary in self.uncertainties().items()
         ]
-        found = {"quoted": self._quoted(), "summary": rows, "uncertainty": uncertainty}
+        found = {
+            "quoted": self._quoted(),
+            "quoted_overlap_accuracy": self._accuracies(),
+            "summary": rows,
+            "uncertainty": uncertainty,
+        }
         head = json.dumps({**self.settings, **found}, indent=2, allow_nan=False)
         lines = ",\n    ".join(json.dumps(answer.to_dict(), allow_nan=False) for answer in self.answers)
         return f'{head[:-2]},\n  "answers": [\n    {lines}\n  ]\n}}\n'
@@ -106,6 +120,13 @@ class Report:
     def _quoted(self) -> dict[str, dict[str, float]]:
         rows = QUOTED.get(self.settings["protocol"]["name"], {})
         return {name: dict(zip(METRICS, values)) for name, values in rows.items()}
+
+    def _accuracies(self) -> dict[str, float]:
+        return OVERLAP_ACCURACY.get(self.settings["protocol"]["name"], {})
+
+    def accuracy_rows(self) -> list[tuple[str, str]]:
+        """Return the paper's overlap accuracies as cells: name and share."""
+        return [(f"{name} (quoted)", f"{value:.3f} / - / -") for name, value in self._accuracies().items()]
 
     def quoted_rows(self) -> list[list[str]]:
         """Return the paper's figures as cells: name and six metrics."""
@@ -148,7 +169,8 @@ def _poses(report: Report) -> Table:
             "recall\n5 deg, .05",
             "or symmetric",
             "x floor\nR",
-            "x floor\nt",
+            "\nmedian",
+            "\nt",
             "CPU, s",
         ),
     )
@@ -166,6 +188,7 @@ def _poses(report: Report) -> Table:
             f"{row.success.share:.1%}",
             share_cell(row.symmetric_success),
             _number(row.floor_ratio_r, "{:.2f}"),
+            _number(row.floor_ratio_r_median, "{:.2f}"),
             _number(row.floor_ratio_t, "{:.2f}"),
             f"{sum(row.cpu_seconds.values()):.2f}",
         )
@@ -176,7 +199,8 @@ def _poses(report: Report) -> Table:
 def _paper(report: Report) -> Table:
     table = make_table(
         "The paper's metrics",
-        "quoted: from the paper, on ModelNet40 with shared points and its rotations, other pairs than these",
+        "quoted: from the paper, with shared points and its rotations, on other pairs than these; compare "
+        "ratios to the statistical floor, not digits",
         ("RMSE(R)", "MAE(R)", "RMSE(t)", "MAE(t)", "Error(R)", "Error(t)"),
     )
     for (group, method, stage), row in report.summaries().items():
@@ -207,7 +231,7 @@ def _matches(report: Report) -> Table:
     )
     previous = ""
     for (group, method, stage), row in report.summaries().items():
-        if stage == FLOOR:
+        if stage == FLOOR or row.inlier_ratio is None:  # who answers as a whole has no matches to show
             continue
         if group != previous and previous:
             table.add_section()
@@ -221,6 +245,10 @@ def _matches(report: Report) -> Table:
             *(_number(row.cpu_seconds.get(step), "{:.2f}") for step in ("look", "solve", "refine")),
         )
         previous = group
+    for place, (name, accuracy) in enumerate(report.accuracy_rows()):
+        if place == 0:
+            table.add_section()
+        table.add_row("", name, "", "", accuracy)
     return table
 
 

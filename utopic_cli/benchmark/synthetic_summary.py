@@ -82,7 +82,8 @@ class Summary:
         success: share within 5 degrees and 0.05.
         symmetric_success: share within that, or in a place that the object's symmetry makes equal.
         floor_ratio_r: ``error_r`` over that of the statistical floor; None without one.
-        floor_ratio_t: likewise.
+        floor_ratio_r_median: likewise of the medians, which single wild failures leave alone.
+        floor_ratio_t: as ``floor_ratio_r``.
         hit_rate: mean share of overlapping source nodes with a right best match.
         inlier_ratio: mean share of right ones among the 250 surest matches.
         first_overlap: overlap as told without a transformation.
@@ -105,6 +106,7 @@ class Summary:
     success: Share
     symmetric_success: Share
     floor_ratio_r: float | None
+    floor_ratio_r_median: float | None
     floor_ratio_t: float | None
     hit_rate: float | None
     inlier_ratio: float | None
@@ -129,6 +131,7 @@ def summarise(answers: Sequence[Answer], floor: Sequence[Answer] = ()) -> Summar
     euler = np.array([pose.euler_deg for pose in poses])
     axes = np.array([pose.axes for pose in poses])
     floor_poses = [answer.pose for answer in floor if answer.pose is not None]
+    floor_rotation = np.array([pose.rotation_deg for pose in floor_poses])
     matches = [answer.matches for answer in answers if answer.matches is not None]
     steps = dict.fromkeys(step for answer in answers for step in answer.cpu_seconds)
     return Summary(
@@ -146,7 +149,8 @@ def summarise(answers: Sequence[Answer], floor: Sequence[Answer] = ()) -> Summar
         fine=wilson(sum(pose.within(RECALLS[0]) for pose in poses), len(answers)),
         success=wilson(sum(pose.within(RECALLS[1]) for pose in poses), len(answers)),
         symmetric_success=wilson(sum(pose.symmetric for pose in poses), len(answers)),
-        floor_ratio_r=_ratio(_mean(rotation), _mean([pose.rotation_deg for pose in floor_poses])),
+        floor_ratio_r=_ratio(_mean(rotation), _mean(floor_rotation)),
+        floor_ratio_r_median=_ratio(_median(rotation), _median(floor_rotation)),
         floor_ratio_t=_ratio(_mean(translation), _mean([pose.translation for pose in floor_poses])),
         hit_rate=_mean_of_known(one.hit_rate for one in matches),
         inlier_ratio=_mean_of_known(one.inlier_ratio for one in matches),

@@ -16,14 +16,18 @@ HERE = Path(__file__).parent
 def document(template: str, fills: Mapping[str, str]) -> str:
     """Fill a template of this folder: each ``{{name}}`` with ``fills[name]``, HTML as it is.
 
-    ``style`` is the style sheet that all pages share.
+    ``head`` is what the heads of all pages share, with ``fills["title"]`` and the style sheet.
     """
-    known = {"style": (HERE / "page.css").read_text(encoding="utf-8"), **fills}
+    head = _filled("page_head.html", {**fills, "style": (HERE / "page.css").read_text(encoding="utf-8")})
+    return _filled(template, {**fills, "head": head})
+
+
+def _filled(template: str, fills: Mapping[str, str]) -> str:
     pieces = (HERE / template).read_text(encoding="utf-8").split("{{")
     text = pieces[0]
     for piece in pieces[1:]:
         name, rest = piece.split("}}", 1)
-        text += known[name] + rest
+        text += fills[name] + rest
     return text
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,6 +11,8 @@ import typer
 
 from utopic_cli.commands.console import (
     SOLVING,
+    WRITING,
+    Colormap,
     Console,
     Debug,
     Device,
@@ -22,16 +23,15 @@ from utopic_cli.commands.console import (
     Verbose,
     Weights,
     stopwatch,
+    to_stdout,
 )
 from utopic_cli.commands.outputs import OutputPlan, check_outputs, make_outputs, plan_outputs, write_outputs
-from utopic_cli.config import AlignOptions
-from utopic_cli.errors import OutputError
+from utopic_cli.config import DEFAULT_COLOUR_MAP, AlignOptions, ColourMapName
 
 if TYPE_CHECKING:
     from utopic_cli.io.scan import Scan
     from utopic_cli.result import RegistrationResult
 
-_OUTPUTS = "What to write"
 _DEFAULTS = AlignOptions()
 
 NOT_TRUSTED = 3
@@ -46,9 +46,9 @@ def align(
             "--output",
             "-o",
             metavar="PATH",
-            help="The transformation: .txt (4x4, row-major), .npy or .json. Without this and --out-dir "
-            "it goes to stdout.",
-            rich_help_panel=_OUTPUTS,
+            help="The transformation: .txt (4x4, row-major), .npy, .json, .pdal.json, .log (Open3D), .kitti, "
+            ".tum or .yaml (ROS). Without this and --out-dir it goes to stdout.",
+            rich_help_panel=WRITING,
         ),
     ] = None,
     out_dir: Annotated[
@@ -57,7 +57,7 @@ def align(
             metavar="DIR",
             help="The whole set: transformation.txt, the aligned scan, four coloured PLYs, report.html, "
             "report.json.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = None,
     aligned: Annotated[
@@ -65,7 +65,7 @@ def align(
         typer.Option(
             metavar="PATH",
             help="SOURCE moved onto TARGET, in its own format with every attribute kept.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = None,
     merged: Annotated[
@@ -73,7 +73,7 @@ def align(
         typer.Option(
             metavar="PATH",
             help="Both scans in the target's frame as one PLY; the field 'scan' says which is which.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = None,
     clouds: Annotated[
@@ -81,30 +81,31 @@ def align(
         typer.Option(
             metavar="DIR",
             help="The four coloured PLYs: redder = more likely overlapping, more uncertain.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="The JSON report.", rich_help_panel=_OUTPUTS)
+        Path | None, typer.Option(metavar="PATH", help="The JSON report.", rich_help_panel=WRITING)
     ] = None,
     html: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH",
             help="A page to look at in a browser, offline: 3D view, verdict, numbers.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = None,
     json_report: Annotated[
         bool,
-        typer.Option("--json", help="The JSON report alone on stdout.", rich_help_panel=_OUTPUTS),
+        typer.Option("--json", help="The JSON report alone on stdout.", rich_help_panel=WRITING),
     ] = False,
+    colormap: Colormap = DEFAULT_COLOUR_MAP,
     overwrite: Overwrite = False,
     init: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="A transformation to try first (.txt, .npy or .json).",
+            help="A transformation to try first, in any form of 'utopic transformation'.",
             rich_help_panel=SOLVING,
         ),
     ] = None,
@@ -139,9 +140,11 @@ def align(
 
     [bold]p_target = T_target_source @ p_source[/bold]
 
-    Reads PLY, PCD, OBJ, XYZ/TXT/PTS, STL, OFF and GLB.
+    Reads PLY, PCD, OBJ, XYZ/TXT/PTS, LAS/LAZ, E57, STL, OFF and GLB.
     No unit, voxel size or radius is needed.
     Nothing existing is replaced without --overwrite.
+
+    Example: [bold]utopic align a.ply b.ply --out-dir result[/bold]
     """
     request = AlignRequest(
         source=source,
@@ -167,16 +170,17 @@ def align(
         ),
         init=init,
         overwrite=overwrite,
+        colormap=colormap,
     )
     outcome = run(request, Console(quiet=quiet, verbose=verbose))
     if json_report:
         from utopic_cli.report import report_bytes
 
-        _to_stdout(report_bytes(outcome.report))
+        to_stdout(report_bytes(outcome.report))
     elif output is None and out_dir is None:
         from utopic_cli.io.transformation import format_transformation
 
-        _to_stdout(format_transformation(outcome.result.T_target_source, ".txt"))
+        to_stdout(format_transformation(outcome.result.T_target_source, "matrix"))
     if not outcome.result.trusted and not exit_zero:
         raise typer.Exit(NOT_TRUSTED)
 
@@ -192,6 +196,7 @@ class AlignRequest:
         options: the pipeline's options.
         init: path of a transformation to try first.
         overwrite: whether existing files may be replaced.
+        colormap: the colours of overlap and uncertainty.
     """
 
     source: Path
@@ -200,6 +205,7 @@ class AlignRequest:
     options: AlignOptions
     init: Path | None = None
     overwrite: bool = False
+    colormap: ColourMapName = DEFAULT_COLOUR_MAP
 
 
 @dataclass(frozen=True)
@@ -241,7 +247,7 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
         )
         progress("writing")
         report = build_report(source, target, result, timings_s)
-        contents = make_outputs(request.plan, source, target, result, report_bytes(report))
+        contents = make_outputs(request.plan, source, target, result, report_bytes(report), request.colormap)
         write_outputs(request.plan, contents, request.overwrite)
     outcome = AlignOutcome(source, target, result, report)
     _say_summary(outcome, request.plan, console)
@@ -250,45 +256,28 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
 
 def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> None:
     """Say the verdict, what it rests on, the motion, and the files written."""
-    report = outcome.report
+    from utopic_cli.result_display import headline
+
+    report, result = outcome.report, outcome.result
     console.warnings(tuple(report["warnings"]))
-    console.line(f"{outcome.source.path} -> {outcome.target.path}: {_verdict(outcome.result)}")
-    for reason in outcome.result.reasons:
+    console.headline(f"{outcome.source.path} -> {outcome.target.path}:", headline(result), result.trusted)
+    for reason in result.reasons:
         because, said = (
             ("but", reason.removeprefix("but ")) if reason.startswith("but ") else ("because", reason)
         )
-        console.line(f"  {because:<9}{said}")
-    fit = outcome.result.fit
+        console.fact(because, said)
+    fit = result.fit
     source, target = fit.overlap_ratio["source"], fit.overlap_ratio["target"]
-    console.line(f"  {'overlap':<9}{source:.0%} of the source, {target:.0%} of the target")
+    console.fact("overlap", f"{source:.0%} of the source, {target:.0%} of the target")
     if math.isfinite(fit.inlier_rmse):
-        console.line(f"  {'residual':<9}{fit.inlier_rmse:.4g} file units rms where they overlap")
+        console.fact("residual", f"{fit.inlier_rmse:.4g} file units rms where they overlap")
     motion = report["about_source_centroid"]
     shift = math.hypot(*motion["translation"])
     angle = f"{motion['angle_deg']:.3f} degrees about the source's centroid"
-    console.line(f"  {'motion':<9}{angle}, which moves by {shift:.6g} file units")
-    for step, seconds in report["timings_s"].items():
-        console.detail(f"  {'time':<9}{step} {seconds:.2f} s")
-    if outcome.result.weights_name:
-        console.detail(f"  {'weights':<9}{outcome.result.weights_name} {outcome.result.weights_sha256[:12]}")
-    for path in plan.paths:
-        console.line(f"  {'wrote':<9}{path}")
-
-
-def _verdict(result: RegistrationResult) -> str:
-    if result.confidence is None:
-        return "aligned, but nothing says how well: do not trust it unseen"
-    verdict = "aligned" if result.trusted else "aligned, but do not trust it"
-    # Never "100%": it is an estimate.
-    said = "over 99%" if result.confidence > 0.99 else f"{result.confidence:.0%}"
-    return f"{verdict}; confidence {said}"
-
-
-def _to_stdout(data: bytes) -> None:
-    if sys.stdout is None:  # closed by whoever started this process
-        raise OutputError("stdout: can't be written: it is closed; name a file with -o")
-    try:
-        sys.stdout.write(data.decode("ascii"))
-        sys.stdout.flush()
-    except OSError as error:
-        raise OutputError(f"stdout: can't be written: {error.strerror}; name a file with -o") from error
+    console.fact("motion", f"{angle}, which moves by {shift:.6g} file units")
+    if console.verbose:
+        for step, seconds in report["timings_s"].items():
+            console.fact("time", f"{step} {seconds:.2f} s")
+        if result.weights_name:
+            console.fact("weights", f"{result.weights_name} {result.weights_sha256[:12]}")
+    console.files(plan.paths)

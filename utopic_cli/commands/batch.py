@@ -92,6 +92,15 @@ def batch(
             rich_help_panel=RUNNING,
         ),
     ] = 0,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="A Dask scheduler, like tcp://host:8786, whose workers do the work instead; they must "
+            "see the same files. Needs utopic-cli\\[cluster].",
+            rich_help_panel=RUNNING,
+        ),
+    ] = None,
     timeout: Annotated[
         float,
         typer.Option(
@@ -118,10 +127,14 @@ def batch(
     Writes poses.json, poses.txt, poses.csv, summary.csv and pairs/*.json.
     Exit codes: 0 all scans in one group; 6 some are left out, or there are several groups; 7 nothing
     aligned.
+
+    Example: [bold]utopic batch scans/ --out-dir model --merge --html[/bold]
     """
     console = Console(quiet=quiet, verbose=verbose)
     if merge_voxel is not None and not (merge and 0.0 < merge_voxel < float("inf")):
         raise UsageError("--merge-voxel needs --merge and a size above 0")
+    if cluster is not None and workers:
+        raise UsageError("--workers is about this machine and --cluster about others; choose one")
     with console.progress() as progress:
         progress("loading libraries")
         from utopic_cli.multiway.batch import run_batch
@@ -133,6 +146,7 @@ def batch(
             pairs=pairs,
             options=AlignOptions(weights=weights, points=points, device=device, threads=threads, seed=seed),
             workers=workers or min(4, _cpus()),
+            cluster=cluster,
             timeout_s=timeout,
             resume=resume,
             overwrite=overwrite,
@@ -170,7 +184,8 @@ def _say_plan(plan: BatchPlan, request: BatchRequest) -> None:
         return
     for source, target in plan.first:
         typer.echo(_printable(f"pair  {scans[source].name}--{scans[target].name}"))
-    typer.echo(f"{len(plan.first)} pairs of {len(plan.usable)} scans, {request.workers} at a time")
+    where = f"{request.workers} at a time" if request.cluster is None else f"on {request.cluster}"
+    typer.echo(f"{len(plan.first)} pairs of {len(plan.usable)} scans, {where}")
 
 
 def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console) -> None:

@@ -7,8 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from utopic_cli.commands.bench import TABLE_WIDTH, JsonOut, Points, Workers
-from utopic_cli.commands.console import Console, Debug, Device, Overwrite, Quiet, Seed, Weights
+from utopic_cli.commands.bench_options import JsonOut, Points, Workers, table_console
+from utopic_cli.commands.console import (
+    MEASURING,
+    WRITING,
+    Console,
+    Debug,
+    Device,
+    Overwrite,
+    Quiet,
+    Seed,
+    Weights,
+)
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
 
@@ -21,8 +31,29 @@ _DEFAULTS = AlignOptions()
 def batch_bench(
     scans: Annotated[
         str,
-        typer.Option(metavar="N,..", help="Numbers of scans, ten of each object; a batch for each."),
+        typer.Option(
+            metavar="N,..",
+            help="Numbers of scans, ten of each object; a batch for each.",
+            rich_help_panel=MEASURING,
+        ),
     ] = "10,30",
+    drawn: Annotated[
+        str,
+        typer.Option(
+            metavar="N,..",
+            help="Further numbers of scans whose pairs are not registered: their answers are drawn from "
+            "those of --scans. Measured are then pairs tried, memory, and the time of all else.",
+            rich_help_panel=MEASURING,
+        ),
+    ] = "",
+    keep: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Keep scans and results there; a later run goes on with them.",
+            rich_help_panel=WRITING,
+        ),
+    ] = None,
     weights: Weights = _DEFAULTS.weights,
     points: Points = _DEFAULTS.points,
     workers: Workers = 1,
@@ -36,10 +67,13 @@ def batch_bench(
     """Simulated scans of several objects, mixed, their names in no order: what a batch makes of them.
 
     Prints pairs tried, time, memory, whether the groups are right, and how many wrong pairs survive.
+
+    Example: [bold]utopic bench batch --scans 20,50 --drawn 100,300 --keep trial[/bold]
     """
     from utopic_cli.io.output import check_writable, write_atomically
 
-    counts = _counts(scans)
+    counts = _counts("--scans", scans)
+    further = _counts("--drawn", drawn) if drawn else []
     check_writable([] if json_out is None else [json_out], overwrite)
     console = Console(quiet=quiet)
     with console.progress() as step:
@@ -47,7 +81,9 @@ def batch_bench(
         from utopic_cli.multiway.trial import run_trials, to_json
 
         options = AlignOptions(weights=weights, points=points, device=device, threads=1, seed=seed)
-        rows = run_trials(counts, options, workers=workers, seed=seed, progress=step)
+        rows = run_trials(
+            counts, options, drawn=further, workers=workers, seed=seed, folder=keep, progress=step
+        )
     if json_out is not None:
         write_atomically(
             Path(json_out), to_json(rows, options, workers, seed).encode("ascii"), overwrite=overwrite
@@ -56,38 +92,42 @@ def batch_bench(
     _print_table(rows)
 
 
-def _counts(text: str) -> list[int]:
+def _counts(option: str, text: str) -> list[int]:
     counts = [int(word) if word.strip().isdecimal() else 0 for word in text.split(",")]
     if min(counts) < 2:
-        raise UsageError(f"--scans {text}: give numbers of scans, 2 at least, like 10,30")
+        raise UsageError(f"{option} {text}: give numbers of scans, 2 at least, like 10,30")
     return counts
 
 
 def _print_table(rows: list[TrialRow]) -> None:
-    from rich.console import Console as RichConsole
     from rich.table import Table
 
     table = Table(
-        "scans", "objects", "pairs", "of all", "time", "memory", "groups", "placed",
-        "wrong pairs", "worst rotation", "worst place",
+        "scans", "objects", "pairs", "of all", "a scan", "a pair", "scans and pairs", "all else", "memory",
+        "groups", "placed", "wrong pairs", "worst rotation", "worst place",
         title="Simulated scans of several objects, mixed",
+        caption="Times are wall time of one process. Memory: this process + the largest worker. "
+        "~: estimated; answers of pairs are drawn from those of other rows, so groups say little there.",
     )  # fmt: skip
     for column in table.columns:
         column.justify = "right"
     for row in rows:
+        about = "~" if row.drawn else ""
+        memory = f"{row.own_mb:.0f} + {row.worker_mb:.0f} MB" if row.own_mb and row.worker_mb else ""
         table.add_row(
             str(row.scans),
             str(row.objects),
             str(row.pairs),
             f"{row.pairs / row.all_pairs:.0%}",
-            f"{row.seconds:.0f} s",
-            "" if row.largest_mb is None else f"{row.largest_mb:.0f} MB",
+            f"{row.scan_s:.1f} s",
+            f"{about}{row.pair_s:.1f} s",
+            f"{about}{row.work_s:.0f} s",
+            f"{row.own_s:.0f} s",
+            memory,
             "exact" if row.exact else f"{row.wrong_joins} scans wrongly" if row.wrong_joins else "in parts",
             str(row.placed),
             str(row.wrong_pairs),
             f"{row.worst_deg:.2f}°",
             f"{row.worst_percent:.2f} %",
         )
-    out = RichConsole()
-    # A file or a pipe has no width: the table gets its own.
-    (out if out.is_terminal else RichConsole(width=TABLE_WIDTH)).print(table)
+    table_console().print(table)

@@ -6,8 +6,18 @@ from typing import Annotated
 
 import typer
 
-from utopic_cli.commands.bench import TABLE_WIDTH, Data, HtmlOut, JsonOut, Outputs, countdown, names
-from utopic_cli.commands.console import Console, Debug, Device, Overwrite, Quiet, Seed, Weights
+from utopic_cli.commands.bench_options import (
+    Baselines,
+    Data,
+    HtmlOut,
+    JsonOut,
+    Outputs,
+    countdown,
+    names,
+    open_data,
+    table_console,
+)
+from utopic_cli.commands.console import MEASURING, Console, Debug, Device, Overwrite, Quiet, Seed, Weights
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
 
@@ -16,18 +26,19 @@ _DEFAULTS = AlignOptions()
 
 def speed(
     data: Data = "procedural",
-    pairs: Annotated[int, typer.Option(min=1, help="Pairs that each case is measured on.")] = 3,
+    pairs: Annotated[
+        int, typer.Option(min=1, help="Pairs that each case is measured on.", rich_help_panel=MEASURING)
+    ] = 3,
     points: Annotated[
-        str, typer.Option(metavar="N,..", help="Most points per cloud that the network sees, one case each.")
-    ] = "512,717,1024,2048,5000",
-    weights: Weights = _DEFAULTS.weights,
-    baselines: Annotated[
         str,
         typer.Option(
-            metavar="NAME,..",
-            help="Measure on the same pairs: open3d-ransac, open3d-ransac-fine, open3d-fgr, kiss-matcher.",
+            metavar="N,..",
+            help="Most points per cloud that the network sees, one case each.",
+            rich_help_panel=MEASURING,
         ),
-    ] = "",
+    ] = "512,717,1024,2048,5000",
+    weights: Weights = _DEFAULTS.weights,
+    baselines: Baselines = "",
     json_out: JsonOut = None,
     html_out: HtmlOut = None,
     overwrite: Overwrite = False,
@@ -39,6 +50,8 @@ def speed(
     """Time and peak memory of the network and of a whole alignment, on one CPU thread and on CUDA.
 
     With --device auto both are measured where there is CUDA. Do nothing else on the machine meanwhile.
+
+    Example: [bold]utopic bench speed --points 717,1024 --json speed.json[/bold]
     """
     outputs = Outputs(json_out, html_out, overwrite)
     outputs.check()
@@ -51,15 +64,9 @@ def speed(
         step("loading libraries")
         from utopic_cli.benchmark.speed import run
         from utopic_cli.benchmark.speed_report import render
-        from utopic_cli.synthesis.packing import open_shapes
 
-        step("making shapes" if data == "procedural" else f"reading shapes from {data}")
-        shapes = open_shapes(data, progress=countdown(step))
+        shapes = open_data(data, step)
         step("making pairs")
         report = run(shapes, data, pairs, seed, weights, sizes, names(baselines), device, countdown(step))
     outputs.write(report, console)
-    from rich.console import Console as RichConsole
-
-    out = RichConsole()
-    # A file or a pipe has no width: the tables get theirs.
-    render(report, out if out.is_terminal else RichConsole(width=TABLE_WIDTH))
+    render(report, table_console())

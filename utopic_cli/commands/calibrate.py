@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from utopic_cli.commands.bench import Data, Points, Workers, countdown
-from utopic_cli.commands.console import Console, Debug, Device, Overwrite, Quiet, Seed
+from utopic_cli.commands.bench_options import Data, Points, Workers, countdown, open_data
+from utopic_cli.commands.console import MEASURING, Console, Debug, Device, Overwrite, Quiet, Seed
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import OutputError
 
@@ -21,7 +21,9 @@ def calibrate(
         Path, typer.Argument(metavar="WEIGHTS", help="A .safetensors file; its JSON card is completed.")
     ],
     data: Data = "procedural",
-    trials: Annotated[int, typer.Option(min=40, help="Labelled pairs to learn from.")] = 800,
+    trials: Annotated[
+        int, typer.Option(min=40, help="Labelled pairs to learn from.", rich_help_panel=MEASURING)
+    ] = 800,
     points: Points = _DEFAULTS.points,
     workers: Workers = 1,
     overwrite: Overwrite = False,
@@ -34,6 +36,8 @@ def calibrate(
 
     Aligns labelled pairs, half of which have no right answer, of shapes held out from training.
     Without this, answers of such weights are never trusted.
+
+    Example: [bold]utopic calibrate runs/mine/utopic.safetensors --data shapes/[/bold]
     """
     from utopic_cli.io.output import check_writable, write_atomically
     from utopic_cli.model.weights import find_weights, read_card
@@ -48,10 +52,8 @@ def calibrate(
     with console.progress() as step:
         step("loading libraries")
         from utopic_cli.benchmark.calibration import calibrate as fit
-        from utopic_cli.synthesis.packing import open_shapes
 
-        step("making shapes" if data == "procedural" else f"reading shapes from {data}")
-        shapes = open_shapes(data, progress=countdown(step))
+        shapes = open_data(data, step)
         step("starting")
         options = AlignOptions(weights=str(path), points=points, device=device, seed=seed)
         found = fit(shapes, data, trials, seed, options, workers, countdown(step))

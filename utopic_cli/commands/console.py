@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import re
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from utopic_cli.config import ColourMapName
+from utopic_cli.errors import OutputError
+
 _DEBUG = "utopic_cli.debug"
 
+MEASURING = "What to measure"
+WRITING = "What to write"
 SOLVING = "How to align"
 RUNNING = "How to run"
+LABEL_WIDTH = 9
+BAR_WIDTH = 16
 SECONDS_BETWEEN_LINES = 10.0  # of progress, where stderr is a file or a pipe
+_COUNT = re.compile(r"(\d+)/(\d+)\b")
 
 
 def debug_wanted(ctx: Any) -> bool:
@@ -33,7 +46,24 @@ Debug = Annotated[
     bool,
     typer.Option("--debug", callback=_remember_debug, is_eager=True, help="Show tracebacks of errors."),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace existing files.", rich_help_panel=WRITING)
+]
+
+
+def complete_weights(incomplete: str) -> list[str]:
+    """Return what a shell may complete ``--weights`` to: bundled names, files and folders."""
+    from utopic_cli.model.bundled import bundled_weights
+
+    typed = Path(incomplete)
+    folder = typed if incomplete.endswith("/") else typed.parent
+    try:
+        there = [path for path in sorted(folder.iterdir()) if path.is_dir() or path.suffix == ".safetensors"]
+    except OSError:
+        there = []
+    words = [*bundled_weights(), *(f"{path}/" if path.is_dir() else str(path) for path in there)]
+    return [word for word in words if word.startswith(incomplete)]
+
 
 Weights = Annotated[
     str,
@@ -41,6 +71,7 @@ Weights = Annotated[
         metavar="NAME|PATH",
         help="Bundled weights by name, or a .safetensors file with its JSON card beside it.",
         rich_help_panel=SOLVING,
+        autocompletion=complete_weights,
     ),
 ]
 Device = Annotated[
@@ -57,6 +88,16 @@ Seed = Annotated[
         min=0,
         help="Seed of every random draw; the same seed on the same kind of machine gives the same bits.",
         rich_help_panel=RUNNING,
+    ),
+]
+
+Colormap = Annotated[
+    ColourMapName,
+    typer.Option(
+        metavar="MAP",
+        help="Colours of overlap and uncertainty. blue-red: redder is more; purple-yellow: lighter is more, "
+        "for every kind of colour vision.",
+        rich_help_panel=WRITING,
     ),
 ]
 
@@ -82,6 +123,46 @@ class Console:
         if not self.quiet:
             self._rich.print(" ".join(text.splitlines()), markup=False, soft_wrap=True)
 
+    def headline(self, about: str, verdict: str, good: bool) -> None:
+        """Write what it is about and how it went, which stands out on a terminal."""
+        if not self.quiet:
+            from rich.text import Text
+
+            text = Text(" ".join(about.splitlines()) + " ")
+            text.append(verdict, style="bold green" if good else "bold yellow")
+            self._rich.print(text, soft_wrap=True)
+
+    def fact(self, label: str, text: str, style: str = "") -> None:
+        """Write one labelled line, unless quiet; on a terminal wrapped, the text in a column of its own.
+
+        Args:
+            label: a word.
+            text: what it is.
+            style: of the text, in rich's words; plain where there is no colour.
+        """
+        if self.quiet:
+            return
+        if not self._rich.is_terminal:
+            self.line(f"  {label:<{LABEL_WIDTH}}{text}")
+            return
+        from rich.table import Table
+        from rich.text import Text
+
+        row = Table.grid()
+        row.add_column(width=2 + LABEL_WIDTH, no_wrap=True)
+        row.add_column(overflow="fold")
+        row.add_row(Text(f"  {label}", style="dim"), Text(" ".join(text.splitlines()), style=style))
+        self._rich.print(row)
+
+    def files(self, paths: Sequence[Path]) -> None:
+        """Say which files were written, a line for each folder."""
+        folders: dict[Path, list[str]] = {}
+        for path in paths:
+            folders.setdefault(path.parent, []).append(path.name)
+        for folder, names in folders.items():
+            text = str(folder / names[0]) if len(names) == 1 else f"{folder}{os.sep}: {', '.join(names)}"
+            self.fact("wrote", text)
+
     def detail(self, text: str) -> None:
         """Write one line if verbose."""
         if self.verbose:
@@ -94,22 +175,53 @@ class Console:
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str], None]]:
-        """Show the step at work while the block runs; where there is no terminal, a line now and then.
+        """Show the step at work while the block runs, and if verbose what the library logs.
 
         Yields:
-            A function to call with the name of each step as it begins.
+            A function to call with the name of each step as it begins. One that begins with a count,
+            like "12/90", gets a bar.
         """
+        with self._log_lines(), self._steps() as progress:
+            yield progress
+
+    @contextmanager
+    def _log_lines(self) -> Iterator[None]:
+        if not self.verbose:
+            yield
+            return
+        logger, handler = logging.getLogger("utopic_cli"), _LogLines(self)
+        level = logger.level
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
+            logger.removeHandler(handler)
+
+    @contextmanager
+    def _steps(self) -> Iterator[Callable[[str], None]]:
+        """Show the step at work; where there is no terminal, a line now and then."""
         if self.quiet or not self._rich.is_terminal:
             yield self._now_and_then()
             return
-        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.table import Column
 
-        columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+        alone = Column(no_wrap=True, overflow="ellipsis", ratio=1)
+        what = TextColumn("{task.description}", markup=False, table_column=alone)
+        columns = (SpinnerColumn(), BarColumn(bar_width=BAR_WIDTH), what, TimeElapsedColumn())
         with Progress(
             *columns, console=self._rich, transient=True, redirect_stdout=False, redirect_stderr=False
         ) as bar:
             task = bar.add_task("starting", total=None)
-            yield lambda step: bar.update(task, description=step)
+
+            def progress(step: str) -> None:
+                count = _COUNT.match(step)
+                done, total = (int(count[1]), int(count[2])) if count else (0, None)
+                bar.update(task, description=step, completed=done, total=total)
+
+            yield progress
 
     def _now_and_then(self) -> Callable[[str], None]:
         said = time.monotonic()
@@ -121,6 +233,33 @@ class Console:
                 self.line(f"  at work: {step}")
 
         return progress
+
+
+class _LogLines(logging.Handler):
+    """Steps that the library logs, as lines; its warnings are said by the commands themselves."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno < logging.WARNING:
+            self._console.fact("step", record.getMessage())
+
+
+def to_stdout(data: bytes) -> None:
+    """Write a result, ASCII text, to stdout.
+
+    Raises:
+        OutputError: stdout is closed or can't be written.
+    """
+    if sys.stdout is None:  # closed by whoever started this process
+        raise OutputError("stdout: can't be written: it is closed; name a file with -o")
+    try:
+        sys.stdout.write(data.decode("ascii"))
+        sys.stdout.flush()
+    except OSError as error:
+        raise OutputError(f"stdout: can't be written: {error.strerror}; name a file with -o") from error
 
 
 @contextmanager

@@ -9,6 +9,8 @@ import typer
 
 from utopic_cli.commands.align import AlignOutcome, AlignRequest, run
 from utopic_cli.commands.console import (
+    WRITING,
+    Colormap,
     Console,
     Debug,
     Device,
@@ -20,7 +22,7 @@ from utopic_cli.commands.console import (
     Weights,
 )
 from utopic_cli.commands.outputs import OutputPlan, check_outputs, plan_outputs, write_outputs
-from utopic_cli.config import AlignOptions
+from utopic_cli.config import DEFAULT_COLOUR_MAP, AlignOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,9 +33,10 @@ _DEFAULTS = AlignOptions()
 
 
 def demo(
-    out_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where to put everything.")] = Path(
-        "utopic-demo"
-    ),
+    out_dir: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where to put everything.", rich_help_panel=WRITING)
+    ] = Path("utopic-demo"),
+    colormap: Colormap = DEFAULT_COLOUR_MAP,
     overwrite: Overwrite = False,
     weights: Weights = _DEFAULTS.weights,
     device: Device = "auto",
@@ -47,6 +50,8 @@ def demo(
 
     The scans see the object from two sides and lie in frames of their own.
     The answer is known: the demo says how far from it the result is.
+
+    Example: [bold]utopic demo --out-dir demo[/bold]
     """
     console = Console(quiet=quiet, verbose=verbose)
     source, target = out_dir / "source.ply", out_dir / "target.ply"
@@ -71,15 +76,19 @@ def demo(
         plan=plan,
         options=AlignOptions(weights=weights, device=device, threads=threads, seed=seed),
         overwrite=overwrite,
+        colormap=colormap,
     )
     with write_outputs(scans, contents, overwrite) as undo:  # without an answer the scans go again
         outcome = run(request, console)
         undo.pop_all()
     _say_error(outcome, pair, console)
+    from utopic_cli.io.colour import COLOUR_MAPS
+
     console.line(f"open {out_dir / 'report.html'} in a browser: both scans in 3D, and the numbers;")
     console.line(f"or look at {out_dir / 'aligned.ply'} together with {target} in any viewer;")
+    more = COLOUR_MAPS[colormap].more
     console.line(
-        "*_overlap.ply and *_uncertainty.ply are redder where there is more; report.json has the numbers"
+        f"*_overlap.ply and *_uncertainty.ply are {more} where there is more; report.json has the numbers"
     )
 
 
@@ -98,7 +107,7 @@ def _say_error(outcome: AlignOutcome, pair: ScanPair, console: Console) -> None:
     found, known = outcome.result.T_target_source, pair.gt_T_target_source
     degrees = relative_rotation_error_deg(found, known)
     distance = relative_translation_error(found, known, pair.source.points.mean(axis=0))
-    console.line(
-        f"  {'error':<9}{degrees:.3f} degrees and {distance / pair.extent:.3%} of the object's size "
-        "from the known answer"
+    console.fact(
+        "error",
+        f"{degrees:.3f} degrees and {distance / pair.extent:.3%} of the object's size from the known answer",
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import Annotated, Any
 
 import typer
@@ -13,14 +15,32 @@ OPTIONAL = {
     "open3d": "baselines of 'utopic bench'; needs system libraries: "
     "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1",
     "tensorboard": "curves of 'utopic train'; pip install 'utopic-cli[train]'",
+    "h5py": "ModelNet40's files; pip install 'utopic-cli[modelnet]'",
+    "kiss-matcher": "a baseline of 'utopic bench'; pip install 'utopic-cli[peers]'",
+    "small-gicp": "a baseline of 'utopic bench'; pip install 'utopic-cli[peers]'",
+    "distributed": "'utopic batch --cluster'; pip install 'utopic-cli[cluster]'",
+    "lazrs": "LAZ files; pip install 'utopic-cli[las]'",
 }
+
+VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "CUDA_VISIBLE_DEVICES",
+    "NO_COLOR",
+    "TERM",
+)
 
 
 def info(
     json_report: Annotated[bool, typer.Option("--json", help="As JSON on stdout.")] = False,
     debug: Debug = False,
 ) -> None:
-    """Print versions, devices, the bundled weights with their hash, and what optional parts are there."""
+    """Print versions, devices, the bundled weights with their hash, and what optional parts are there.
+
+    Put its output into reports of bugs.
+
+    Example: [bold]utopic info[/bold]
+    """
     with Console().progress() as progress:
         progress("loading libraries")
         facts = collect()
@@ -47,17 +67,31 @@ def collect() -> dict[str, dict[str, Any]]:
 
     versions = {"utopic-cli": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
-    devices = {"cpu": f"{torch.get_num_threads()} threads"}
+    devices = {"cpu": f"{_cpus()} CPUs, {torch.get_num_threads()} threads"}
     if torch.cuda.is_available():
-        devices["cuda"] = torch.cuda.get_device_name()
+        devices["cuda"] = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
     if torch.backends.mps.is_available():
         devices["mps"] = "available"
     return {
         "versions": versions | {name: _version(name) for name in REQUIRED},
         "devices": devices,
+        "environment": _environment(),
         "weights": _weights(),
         "optional": {name: _optional(name) for name in OPTIONAL},
     }
+
+
+def _cpus() -> int:
+    """Count the CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _environment() -> dict[str, str]:
+    """Return what else changes how the tool behaves."""
+    found = {"encoding": f"{sys.stdout.encoding}, files {sys.getfilesystemencoding()}"}
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        found["memory"] = f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
+    return found | {name: os.environ[name] for name in VARIABLES if name in os.environ}
 
 
 def _version(name: str) -> str:
@@ -77,7 +111,7 @@ def _optional(name: str) -> str:
     if version == "not installed":
         return f"{version} ({OPTIONAL[name]})"
     try:
-        import_module(name)
+        import_module(name.replace("-", "_"))
     except Exception as error:  # whatever it meets: libraries it lacks, another NumPy
         return f"{version}, can't be loaded: {' '.join(str(error).split())} ({OPTIONAL[name]})"
     return version
@@ -87,7 +121,8 @@ def _weights() -> dict[str, Any]:
     import hashlib
 
     from utopic_cli.errors import InputError
-    from utopic_cli.model.weights import bundled_weights, read_card
+    from utopic_cli.model.bundled import bundled_weights
+    from utopic_cli.model.weights import read_card
 
     found: dict[str, Any] = {}
     for name, path in bundled_weights().items():

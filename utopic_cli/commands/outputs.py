@@ -7,7 +7,7 @@ report comes last, so that a set with a report is a whole set.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING, Any
 from utopic_cli.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from utopic_cli.config import ColourMapName
     from utopic_cli.io.scan import Scan
     from utopic_cli.result import RegistrationResult
 
-TRANSFORMATION_SUFFIXES = (".txt", ".npy", ".json")
 MERGED_COMMENTS = ("utopic merged scans in the target's frame: scan 0 = source, 1 = target",)
 CLOUD_KINDS = ("source_overlap", "target_overlap", "source_uncertainty", "target_uncertainty")
 
@@ -59,9 +61,11 @@ def plan_outputs(
     Raises:
         UsageError: a suffix names a format that the output can't have.
     """
-    if output is not None and output.suffix.lower() not in TRANSFORMATION_SUFFIXES:
-        known = ", ".join(TRANSFORMATION_SUFFIXES)
-        raise UsageError(f"{output}: the transformation's format is told by its suffix; use one of {known}")
+    from utopic_cli.io.transformation import SUFFIXES, form_of
+
+    if output is not None and form_of(output) is None:
+        known = ", ".join(SUFFIXES)
+        raise UsageError(f"{output}: the transformation's form is told by its suffix; use one of {known}")
     if aligned is not None and aligned.suffix.lower() != source.suffix.lower():
         raise UsageError(
             f"{aligned}: --aligned keeps the source's format; let the name end in '{source.suffix}'"
@@ -131,6 +135,7 @@ def make_outputs(
     target: Scan,
     result: RegistrationResult,
     report: bytes,
+    colormap: ColourMapName,
 ) -> dict[Path, bytes]:
     """Make the content of every file in the plan.
 
@@ -140,32 +145,38 @@ def make_outputs(
         target: the scan that stays.
         result: the answer.
         report: content of the report.
+        colormap: the colours of overlap and uncertainty.
 
     Returns:
         Content by path, in the order of writing.
     """
+    from utopic_cli.commands.kept_fields import kept_fields
     from utopic_cli.io.ply_writer import merged_cloud_ply
-    from utopic_cli.io.transformation import format_transformation
+    from utopic_cli.io.transformation import form_of, format_transformation
 
     contents: dict[Path, bytes] = {}
+    kept: dict[str, dict[str, np.ndarray]] = {}
     for kind, path in plan.files:
         if kind == "transformation":
-            contents[path] = format_transformation(result.T_target_source, path.suffix.lower())
+            contents[path] = format_transformation(result.T_target_source, form_of(path) or "matrix")
         elif kind == "aligned":
             contents[path] = source.moved(result.T_target_source)
         elif kind == "merged":
             moved = source.cloud.transformed(result.T_target_source)
             contents[path] = merged_cloud_ply(moved.points, target.cloud.points, MERGED_COMMENTS)
         elif kind == "html":
-            contents[path] = page_of(source, target, result)
+            contents[path] = page_of(source, target, result, colormap)
         elif kind == "report":
             contents[path] = report
         else:
-            contents[path] = coloured_cloud(kind, source, target, result)
+            side = kind.split("_")[0]
+            if side not in kept:
+                kept[side] = kept_fields(source if side == "source" else target)
+            contents[path] = coloured_cloud(kind, source, target, result, kept[side], colormap)
     return contents
 
 
-def page_of(source: Scan, target: Scan, result: RegistrationResult) -> bytes:
+def page_of(source: Scan, target: Scan, result: RegistrationResult, colormap: ColourMapName) -> bytes:
     """Return the self-contained HTML page of one alignment."""
     from utopic_cli import page
     from utopic_cli.report import all_warnings
@@ -177,10 +188,18 @@ def page_of(source: Scan, target: Scan, result: RegistrationResult) -> bytes:
         source_name=source.path.name,
         target_name=target.path.name,
         warnings=all_warnings(source, target),
+        colormap=colormap,
     ).encode("utf-8")
 
 
-def coloured_cloud(kind: str, source: Scan, target: Scan, result: RegistrationResult) -> bytes:
+def coloured_cloud(
+    kind: str,
+    source: Scan,
+    target: Scan,
+    result: RegistrationResult,
+    kept: Mapping[str, np.ndarray],
+    colormap: ColourMapName,
+) -> bytes:
     """Return a scan's points with overlap and uncertainty as scalar fields, coloured by one of them.
 
     Args:
@@ -188,16 +207,22 @@ def coloured_cloud(kind: str, source: Scan, target: Scan, result: RegistrationRe
         source: the scan that moves; its points are written where the file has them, not moved.
         target: the scan that stays.
         result: the answer.
+        kept: further fields of the scan, name to (N,) values.
+        colormap: the colours.
     """
-    from utopic_cli.io.colour import colour_map
+    from utopic_cli.io.colour import COLOUR_MAPS, colour_map
     from utopic_cli.io.ply_writer import scalar_cloud_ply
 
     side, shown = kind.split("_")
     scan = source if side == "source" else target
     fields = {name: getattr(result, f"{side}_{name}") for name in ("overlap", "uncertainty")}
     meaning = "likely to overlap" if shown == "overlap" else "uncertain"
-    comments = (f"utopic {side} {shown}: redder = more {meaning}", "points in the scan's own frame and units")
-    return scalar_cloud_ply(scan.cloud.points, colour_map(fields[shown]), fields, comments)
+    comments = (
+        f"utopic {side} {shown}: {COLOUR_MAPS[colormap].more} = more {meaning}",
+        "points in the scan's own frame and units; original_*: as in the scan's file",
+    )
+    colours = colour_map(fields[shown], colormap)
+    return scalar_cloud_ply(scan.cloud.points, colours, {**fields, **kept}, comments, shown)
 
 
 def write_outputs(plan: OutputPlan, contents: dict[Path, bytes], overwrite: bool) -> ExitStack:

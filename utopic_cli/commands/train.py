@@ -59,7 +59,7 @@ def train(
     Checkpoints survive a kill: run the same command with --resume to go on.
     Open RUN/curves.html at any time to see how far it is.
 
-    Example: utopic train --out first --minutes 5
+    Example: [bold]utopic train --data shapes/ --out runs/mine --minutes 60[/bold]
     """
     # torchrun starts this several times; one of them writes and speaks for all.
     leads = os.environ.get("RANK", "0") == "0"

@@ -7,36 +7,18 @@ the test files are the test.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from utopic_cli.errors import InputError
+from utopic_cli.synthesis.hdf5_clouds import CloudSet, read_clouds
 
 SEEN_CATEGORIES = 20
 _WHERE = (
     "the data set is distributed by Stanford/ModelNet, as modelnet40_ply_hdf5_2048.zip by the authors "
     "of PointNet"
 )
-
-
-@dataclass(frozen=True)
-class CloudSet:
-    """Clouds that belong to a data set.
-
-    Attributes:
-        points: (N, S, 3) float32, in the data set's own frame and scale.
-        names: of each, file and row.
-        splits: ``train``, ``val`` or ``test``.
-        categories: of each.
-    """
-
-    points: np.ndarray
-    names: list[str]
-    splits: list[str]
-    categories: list[str]
 
 
 def find_modelnet40(root: Path) -> list[Path]:
@@ -67,7 +49,7 @@ def read_modelnet40(root: Path) -> CloudSet:
     for file in files:
         if file.suffix != ".h5":
             continue
-        clouds, labels = _read(file)
+        clouds, labels = read_clouds(file, _WHERE)
         testing = file.name.startswith("ply_data_test")
         seen = labels < SEEN_CATEGORIES
         rows = np.flatnonzero(seen | testing)
@@ -80,29 +62,3 @@ def read_modelnet40(root: Path) -> CloudSet:
     if len({cloud.shape[1] for cloud in points}) != 1:
         raise InputError(f"{root}: its files have clouds of different sizes; download them again")
     return CloudSet(np.concatenate(points), names, splits, categories)
-
-
-def _read(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the clouds (N, S, 3) float32 and labels (N,) int64 of one file."""
-    h5py = _load_h5py()
-    try:
-        with h5py.File(file, "r") as content:
-            clouds = np.asarray(content["data"], dtype=np.float32)
-            labels = np.asarray(content["label"]).reshape(-1).astype(np.int64)
-    except KeyError as error:
-        raise InputError(f"{file}: has no arrays 'data' and 'label'; {_WHERE}") from error
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{file}: can't be read as HDF5 ({error}); download it again") from error
-    if clouds.ndim != 3 or clouds.shape[2] != 3 or len(labels) != len(clouds) or (labels < 0).any():
-        raise InputError(f"{file}: 'data' is not (N, 2048, 3) with one 'label' each; {_WHERE}")
-    return clouds, labels
-
-
-def _load_h5py() -> Any:
-    try:
-        import h5py
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"ModelNet40 is read with h5py, which can't be loaded ({error}); pip install h5py"
-        ) from error
-    return h5py

@@ -18,9 +18,11 @@ import numpy as np
 
 from utopic_cli.errors import InputError, OutputError
 from utopic_cli.io.output import check_writable, write_atomically
+from utopic_cli.synthesis.hdf5_clouds import CloudSet
 from utopic_cli.synthesis.mesh_form import PackedMesh, packed_mesh
-from utopic_cli.synthesis.modelnet40 import CloudSet, find_modelnet40, read_modelnet40
+from utopic_cli.synthesis.modelnet40 import find_modelnet40, read_modelnet40
 from utopic_cli.synthesis.reconstruction import mesh_from_points
+from utopic_cli.synthesis.scanobjectnn import find_scanobjectnn, read_scanobjectnn
 from utopic_cli.synthesis.shape_files import CLOUD_SUFFIXES, MESH_SUFFIXES, find_shape_files, read_shape
 from utopic_cli.synthesis.shapes import ShapeLibrary, load_shapes, packed_files, procedural_shapes
 from utopic_cli.synthesis.surface import DegenerateShape
@@ -30,6 +32,7 @@ PROCEDURAL_SHAPES = 200
 PROCEDURAL_RESOLUTION = 40  # 200 shapes take some ten seconds
 PROCEDURAL_SEED = 20221015  # another stream than any training seed; the shapes are always the same
 MODELNET40 = "modelnet40:"
+SCANOBJECTNN = "scanobjectnn:"
 
 Progress = Callable[[int, int, str], None]
 Item = TypeVar("Item")
@@ -49,6 +52,8 @@ def open_shapes(data: str, *, progress: Progress | None = None) -> ShapeLibrary:
       validation if the SHA-1 of its set, folder and stem says so, about one in ten.
     - ``modelnet40:DIR``: the HDF5 files of ``modelnet40_ply_hdf5_2048``, see ``modelnet40``;
       packed and cached likewise, the original points kept as ``samples``.
+    - ``scanobjectnn:PATH``: the HDF5 test file of ScanObjectNN, or a folder with it, see
+      ``scanobjectnn``; packed and cached in the same way.
 
     Args:
         data: as above.
@@ -64,12 +69,18 @@ def open_shapes(data: str, *, progress: Progress | None = None) -> ShapeLibrary:
     if data == PROCEDURAL:
         rng = np.random.default_rng(PROCEDURAL_SEED)
         return procedural_shapes(rng, PROCEDURAL_SHAPES, PROCEDURAL_RESOLUTION)
-    if not data.removeprefix(MODELNET40):
+    if not data.removeprefix(MODELNET40).removeprefix(SCANOBJECTNN):
         raise InputError(f"'{data}': no such folder of shapes; name one, or '{PROCEDURAL}'")
     if data.startswith(MODELNET40):
         root = _folder(data.removeprefix(MODELNET40))
         parts = find_modelnet40(root)
         return _cached(root, MODELNET40, parts, lambda: _pack_clouds(root, read_modelnet40(root), progress))
+    if data.startswith(SCANOBJECTNN):
+        file = find_scanobjectnn(Path(data.removeprefix(SCANOBJECTNN)))
+        kind = SCANOBJECTNN + file.name  # several such files may lie in one folder
+        return _cached(
+            file.parent, kind, [file], lambda: _pack_clouds(file.parent, read_scanobjectnn(file), progress)
+        )
     if Path(data).is_file() and Path(data).suffix.lower() != ".npz":
         raise InputError(f"{data}: is a file; name the folder of shapes, or packed meshes (.npz)")
     if packed_files(Path(data)):
@@ -83,6 +94,16 @@ def open_shapes(data: str, *, progress: Progress | None = None) -> ShapeLibrary:
             f"or use '{PROCEDURAL}'"
         )
     return _cached(root, "files", files, lambda: _pack_files(root, files, progress))
+
+
+def describe_data(data: str) -> str:
+    """Say in words what shapes ``data`` stands for."""
+    if data == PROCEDURAL:
+        return "built-in procedural shapes"
+    for prefix, name in ((MODELNET40, "ModelNet40"), (SCANOBJECTNN, "ScanObjectNN")):
+        if data.startswith(prefix):
+            return f"{name} in {data.removeprefix(prefix)}"
+    return data
 
 
 def describe_skipped(library: ShapeLibrary, most: int = 3) -> str | None:

@@ -13,6 +13,7 @@ from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair, check_cloud
 from utopic_cli.synthesis.scanner import depth_map
 from utopic_cli.synthesis.settings import PairSettings
 from utopic_cli.synthesis.surface import bounding_diagonal, normalised, sample_surface
+from utopic_cli.synthesis.warp import SmoothWarp
 
 OUTSIDE_SAMPLES = 30_000
 OUTSIDE_VIEWS = 14
@@ -29,6 +30,7 @@ def surface_pair(
     clip: float = 0.05,
     rotations: str = "uniform",
     sample: np.ndarray | None = None,
+    relief: SmoothWarp | None = None,
     whole: bool = False,
 ) -> ScanPair:
     """Make a pair by the paper's protocol (Sec. 4.1): sample, crop by half-spaces, jitter, move.
@@ -50,6 +52,7 @@ def surface_pair(
             Euler angle uniform in 0 to 45 degrees, translation uniform within 0.5).
         sample: (S, 3) points to draw from instead of the mesh's surface, in the mesh's frame and
             already of the scale wanted (a data set that gives points).
+        relief: bends the sampled surface, of an object of extent 2; not for points that are given.
         whole: let a sample of the whole object travel with the pair.
 
     Returns:
@@ -64,13 +67,18 @@ def surface_pair(
     if rotations not in ("uniform", "euler45"):
         raise ValueError(f"rotations is {rotations!r}; expected 'uniform' or 'euler45'")
     if sample is None:
-        points = outer_points(*sample_surface(normalised(mesh[0]), mesh[1], OUTSIDE_SAMPLES, rng))
+        surface = sample_surface(normalised(mesh[0]), mesh[1], OUTSIDE_SAMPLES, rng)
+        points = outer_points(
+            *(surface if relief is None else (relief(surface[0]), relief.normals(*surface)))
+        )
         points = dense = normalised(points[rng.permutation(len(points))].astype(np.float64))
     else:
         points = sample[rng.permutation(len(sample))].astype(np.float64)
         dense = sample_surface(*mesh, OUTSIDE_SAMPLES, rng.spawn(1)[0])[0] if whole else points
     if len(points) < 2 * count:
-        raise DegeneratePair(f"only {len(points)} points of the surface can be seen from outside")
+        raise DegeneratePair(
+            f"only {len(points)} points of the surface are seen or given; {2 * count} are needed"
+        )
     first = points[:count]
     second = first if sampling == "shared" else points[count : 2 * count]
     clouds, indices = [], []
