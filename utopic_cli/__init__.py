@@ -12,19 +12,28 @@ float64.
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from utopic_cli.pipeline import align as align
+    from utopic_cli.result import RegistrationResult as RegistrationResult
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "align"]
+__all__ = ["RegistrationResult", "__version__", "align"]
+
+# Steps and warnings go to the logger "utopic_cli", silent until a program asks for it.
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 
 def __getattr__(name: str) -> Any:
-    """Import ``align`` on first use: it pulls in torch, which ``utopic --help`` must not."""
+    """Import on first use: ``align`` pulls in torch, which ``utopic --help`` must not."""
     if name == "align":
         from utopic_cli.pipeline import align
 
         return align
+    if name == "RegistrationResult":
+        from utopic_cli.result import RegistrationResult
+
+        return RegistrationResult
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

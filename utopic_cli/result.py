@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from utopic_cli.result_display import as_html, one_line
+
 
 @dataclass(frozen=True)
 class Correspondences:
@@ -135,3 +137,10 @@ class RegistrationResult:
     weights_name: str = ""
     weights_sha256: str = ""
     options: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def _repr_html_(self) -> str:
+        """Show the verdict, its reasons, the matrix and the measures in a notebook."""
+        return as_html(self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from utopic_cli.errors import InputError
+from utopic_cli.io.e57 import read_e57
 from utopic_cli.io.files import read_bytes
+from utopic_cli.io.las import read_las
 from utopic_cli.io.mesh import read_mesh
 from utopic_cli.io.obj import read_obj
 from utopic_cli.io.pcd import read_pcd
@@ -19,6 +22,8 @@ from utopic_cli.io.ply import read_ply
 from utopic_cli.io.records import FormatError, Records
 from utopic_cli.io.text import read_text
 from utopic_cli.point_cloud import PointCloud
+
+_log = logging.getLogger(__name__)
 
 FEWEST_POINTS = 50
 # Spread across the second axis, relative to the first, below which points lie on a line.
@@ -29,6 +34,8 @@ _READERS: dict[str, Callable[[bytes], Records]] = {
     "ply": read_ply,
     "pcd": read_pcd,
     "obj": read_obj,
+    **dict.fromkeys(("las", "laz"), read_las),
+    "e57": read_e57,
     **dict.fromkeys(("xyz", "txt", "pts", "asc", "csv"), read_text),
 }
 _MESHES = ("stl", "off", "glb")
@@ -72,16 +79,18 @@ class Scan:
         return self.document.moved(transformation)
 
 
-def read_scan(path: str | os.PathLike[str], *, seed: int = 0) -> Scan:
+def read_scan(path: str | os.PathLike[str], *, seed: int = 0, to_align: bool = True) -> Scan:
     """Read a scan file strictly.
 
     Args:
         path: a regular file; its suffix says the format.
         seed: of the points drawn from a mesh (STL, OFF, GLB).
+        to_align: refuse points that fix no transformation, and warn of what is left out; without
+            it any file is read that can be moved.
 
     Raises:
-        InputError: the file can't be read, is not sound, or holds fewer than 50 distinct
-            finite points, or all on a line. One line: file, reason, what to do.
+        InputError: the file can't be read, is not sound, or (to align it) holds fewer than 50
+            distinct finite points, or all on a line. One line: file, reason, what to do.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -97,20 +106,28 @@ def read_scan(path: str | os.PathLike[str], *, seed: int = 0) -> Scan:
             records = _READERS[kind](data)
         kept = np.flatnonzero(records.finite)
         points = records.points if len(kept) == len(records.points) else records.points[kept]
-        check_points(points, len(records.points))
+        if to_align:
+            check_points(points, len(records.points))
+        else:
+            _check_coordinates(points, len(records.points))
     except FormatError as error:
         raise InputError(f"{path}: {_printable(str(error))}") from None
     except MemoryError:
         raise InputError(f"{path}: is too large for this machine's memory; thin it out first") from None
-    warnings = [_printable(warning) for warning in records.warnings]
+    # A mesh that is only moved is moved itself, whatever was drawn from it.
+    told = records.warnings if to_align or kind not in _MESHES else ()
+    warnings = [_printable(warning) for warning in told]
     dropped = len(records.points) - len(kept)
-    if dropped:
+    if dropped and to_align:
         warnings.append(f"{dropped} of {len(records.points)} points are NaN or infinite and were left out")
     normals = None
     if records.normals is not None:
         normals = _unit(records.normals[kept])
-        if normals is None:
+        if normals is None and to_align:
             warnings.append("its normals are not used: some are zero or not finite")
+    _log.info("read %s: %d points", path, len(points))
+    for warning in warnings:
+        _log.warning("%s: %s", path, warning)
     digest = hashlib.sha256(data).hexdigest()
     cloud = PointCloud(np.ascontiguousarray(points), normals)
     return Scan(path, cloud, kept, len(records.points), kind, digest, tuple(warnings), records)
@@ -126,6 +143,10 @@ def _check_magic(data: bytes, kind: str) -> None:
         content = "pcd"
     elif head.startswith(b"glTF"):
         content = "glb"
+    elif head.startswith(b"LASF"):
+        content = kind if kind in ("las", "laz") else "las"
+    elif head.startswith(b"ASTM-E57"):
+        content = "e57"
     if content is not None and content != kind:
         raise FormatError(f"is a {content.upper()} file by its content; rename it to end in .{content}")
 
@@ -140,10 +161,7 @@ def check_points(points: np.ndarray, records: int) -> None:
     Raises:
         FormatError: too few distinct points, all on a line, or coordinates beyond all reason.
     """
-    if len(points) == 0:
-        raise FormatError(f"none of its {records} points is finite; export it again")
-    if np.abs(points).max() > _LARGEST_COORDINATE:
-        raise FormatError("has coordinates beyond 1e100; the file is damaged, export it again")
+    _check_coordinates(points, records)
     if (points == points[0]).all():
         raise FormatError(f"all of its {len(points)} points are equal; export it again")
     distinct = _count_distinct(points)
@@ -157,6 +175,13 @@ def check_points(points: np.ndarray, records: int) -> None:
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))  # ascending
     if spread[1] <= _LINE * spread[2]:
         raise FormatError("all of its points lie on a line; use a scan of a surface")
+
+
+def _check_coordinates(points: np.ndarray, records: int) -> None:
+    if len(points) == 0:
+        raise FormatError(f"none of its {records} points is finite; export it again")
+    if np.abs(points).max() > _LARGEST_COORDINATE:
+        raise FormatError("has coordinates beyond 1e100; the file is damaged, export it again")
 
 
 def _count_distinct(points: np.ndarray) -> int:

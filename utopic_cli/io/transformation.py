@@ -1,4 +1,8 @@
-"""Transformations as files: text, NumPy or JSON."""
+"""Transformations as files, in the forms of this tool and of the programs around it.
+
+A file may hold several (KITTI and TUM trajectories, ``poses.json``, Open3D's logs); one of them is
+named behind a ``#``: ``poses.json#scan-a``, ``trajectory.tum#12`` (rows counted from 1).
+"""
 
 from __future__ import annotations
 
@@ -6,78 +10,196 @@ import io
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from utopic_cli.errors import InputError, OutputError
-from utopic_cli.io.ascii_table import parse_table
 from utopic_cli.io.files import read_bytes
+from utopic_cli.io.plain_yaml import parse_yaml
+from utopic_cli.io.quaternion import quaternion_of
 from utopic_cli.io.records import FormatError
+from utopic_cli.io.transformation_rows import entries_of_rows
+from utopic_cli.io.transformation_tree import Entries, entries_of_tree
 
-SUFFIXES = (".txt", ".npy", ".json")
 CONVENTION = "p_target = T_target_source @ p_source"
+
+FORMS = {
+    "matrix": "4 rows of 4 numbers: CloudCompare, PDAL, NumPy's loadtxt",
+    "npy": "NumPy's np.save",
+    "json": "T_target_source with its convention",
+    "pdal": "a pipeline with filters.transformation",
+    "open3d": "a line of numbers and the 4x4, as in Open3D's .log",
+    "kitti": "one row of 12 numbers",
+    "tum": "t tx ty tz qx qy qz qw",
+    "ros": "geometry_msgs/TransformStamped as YAML",
+}
+"""Form by name, and what it is. Every form is read as well, told by the file's content."""
+
+FORM_OF_SUFFIX = {
+    ".txt": "matrix",
+    ".npy": "npy",
+    ".json": "json",
+    ".pdal.json": "pdal",
+    ".log": "open3d",
+    ".kitti": "kitti",
+    ".tum": "tum",
+    ".yaml": "ros",
+    ".yml": "ros",
+}
+SUFFIXES = tuple(FORM_OF_SUFFIX)
+
 # How far the rotation may be from orthonormal: files with few digits are common.
 _TOLERANCE = 1e-3
-_LARGEST_FILE = 1 << 20  # bytes; sixteen numbers and some JSON around them
+_LARGEST_FILE = 1 << 26  # bytes: a trajectory of some 100,000 poses
 
 
-def format_transformation(transformation: np.ndarray, suffix: str) -> bytes:
+def form_of(path: str | os.PathLike[str]) -> str | None:
+    """Return the form that a file name asks for by its suffix, or None if by none of them."""
+    name = Path(path).name.lower()
+    # The longest first: T.pdal.json is no plain .json.
+    for suffix in sorted(FORM_OF_SUFFIX, key=len, reverse=True):
+        if name.endswith(suffix) and name != suffix:
+            return FORM_OF_SUFFIX[suffix]
+    return None
+
+
+def format_transformation(transformation: np.ndarray, form: str) -> bytes:
     """Return a (4, 4) transformation as the bytes of a file.
 
     Args:
         transformation: (4, 4) float64, ``p_target = T_target_source @ p_source``.
-        suffix: ``.txt`` (row-major, blanks between numbers, 17 digits), ``.npy`` or ``.json``.
+        form: one of ``FORMS``, or a suffix that stands for one. Text carries 17 digits.
 
     Raises:
-        OutputError: the suffix is another one.
+        OutputError: the form is another one.
     """
     matrix = np.asarray(transformation, np.float64)
-    suffix = suffix.lower()
-    if suffix == ".txt":
-        return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix).encode()
-    if suffix == ".npy":
+    form = FORM_OF_SUFFIX.get(form.lower(), form)
+    rows = [" ".join(f"{value:.17g}" for value in row) for row in matrix]
+    if form == "matrix":
+        return _lines(rows)
+    if form == "npy":
         stream = io.BytesIO()
         np.save(stream, matrix, allow_pickle=False)
         return stream.getvalue()
-    if suffix == ".json":
-        content = {"convention": CONVENTION, "T_target_source": matrix.tolist()}
-        return (json.dumps(content, indent=1) + "\n").encode()
-    raise OutputError(f"a transformation can't be written as '{suffix}'; use {', '.join(SUFFIXES)}")
+    if form == "json":
+        return _json({"convention": CONVENTION, "T_target_source": matrix.tolist()})
+    if form == "pdal":
+        return _json({"pipeline": [{"type": "filters.transformation", "matrix": " ".join(rows)}]})
+    if form == "open3d":
+        return _lines(["0 0 1", *rows])
+    if form == "kitti":
+        return _lines([" ".join(rows[:3])])
+    if form == "tum":
+        return _lines(
+            [" ".join(["0", *(f"{v:.17g}" for v in (*matrix[:3, 3], *quaternion_of(matrix[:3, :3])))])]
+        )
+    if form == "ros":
+        return _lines(_ros_lines(matrix))
+    raise OutputError(f"a transformation can't be written as '{form}'; use one of {', '.join(FORMS)}")
+
+
+def _lines(lines: list[str]) -> bytes:
+    return "".join(f"{line}\n" for line in lines).encode("ascii")
+
+
+def _json(content: dict[str, object]) -> bytes:
+    return (json.dumps(content, indent=1) + "\n").encode("ascii")
+
+
+def _ros_lines(matrix: np.ndarray) -> list[str]:
+    """Return a TransformStamped: it takes points of the child's frame to the header's frame."""
+
+    def vector(names: str, values: np.ndarray) -> list[str]:
+        return [f"    {name}: {float(value)!r}" for name, value in zip(names, values)]
+
+    lines = [f"# {CONVENTION}", "header:", "  frame_id: target", "child_frame_id: source", "transform:"]
+    lines += ["  translation:", *vector("xyz", matrix[:3, 3])]
+    return [*lines, "  rotation:", *vector("xyzw", quaternion_of(matrix[:3, :3]))]
+
+
+def split_entry(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
+    """Split ``FILE#ENTRY`` into the file and the name of one of its transformations, or None.
+
+    A file whose own name holds a ``#`` is taken as it is, if it exists.
+    """
+    whole = str(path)
+    if os.path.exists(whole):
+        return Path(whole), None
+    for place in (i for i, letter in enumerate(whole) if letter == "#"):
+        if os.path.isfile(whole[:place]):
+            return Path(whole[:place]), whole[place + 1 :]
+    return Path(whole), None
 
 
 def read_transformation(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read a rigid transformation from .txt (4x4), .npy or .json (``T_target_source``).
+    """Read a rigid transformation in any of the forms; ``FILE#ENTRY`` names one of several.
+
+    ``.npy`` is NumPy's, ``.json`` and ``.yaml`` are told by their keys, every other suffix is
+    rows of numbers, told by their number and length.
 
     Returns:
         (4, 4) float64 with its rotation projected to the nearest exact one.
 
     Raises:
-        InputError: the file can't be read, holds no (4, 4) matrix, or the matrix is not
-            rigid within 1e-3 (it scales, shears or mirrors).
+        InputError: the file can't be read, holds no transformation or several, or what it holds
+            is not rigid within 1e-3 (it scales, shears or mirrors).
     """
-    path = Path(path)
-    readers = {".txt": _from_text, ".npy": _from_npy, ".json": _from_json}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: is no transformation file; use {', '.join(SUFFIXES)}")
-    data = read_bytes(path)
+    file, entry = split_entry(path)
+    if form_of(file) is None and not file.is_dir():
+        raise InputError(f"{file}: is no transformation file by its name; use {', '.join(SUFFIXES)}")
+    data = read_bytes(file)
     if len(data) > _LARGEST_FILE:
-        raise InputError(f"{path}: is too large for a transformation; it should hold 4 rows of 4 numbers")
+        raise InputError(f"{file}: is too large for a transformation; check what it is")
     try:
-        return _rigid(reader(data))
+        return _rigid(_chosen(_entries(data, file.suffix.lower()), entry, file))
     except FormatError as error:
-        raise InputError(f"{path}: {error}") from None
+        # A file's own words may be quoted: one plain line, whatever they are.
+        text = "".join(letter if letter.isprintable() else "?" for letter in str(error))
+        raise InputError(f"{path}: {text}") from None
 
 
-def _from_text(data: bytes) -> np.ndarray:
-    lines = [line for line in data.splitlines() if line.strip() and not line.lstrip().startswith(b"#")]
-    if len(lines) != 4:
-        raise FormatError(f"has {len(lines)} rows; a transformation is 4 rows of 4 numbers")
-    return parse_table(lines, 4, range(4), lambda i: f"row {i + 1}")
+def _entries(data: bytes, suffix: str) -> Entries:
+    """Return the transformations of a file by name, not yet checked for being rigid."""
+    if suffix == ".npy":
+        return _from_npy(data)
+    if suffix == ".json":
+        try:
+            return entries_of_tree(json.loads(data))
+        except RecursionError:
+            raise FormatError("is not JSON (too many brackets); write it again") from None
+        except ValueError as error:
+            raise FormatError(f"is not JSON ({_one_line(error)}); write it again") from None
+    if suffix in (".yaml", ".yml"):
+        documents = [entries_of_tree(document) for document in parse_yaml(data)]
+        if len(documents) == 1:
+            return documents[0]
+        several = [matrix for document in documents for _, matrix in document]
+        return [(str(number), matrix) for number, matrix in enumerate(several, 1)]
+    return entries_of_rows(data)
 
 
-def _from_npy(data: bytes) -> np.ndarray:
+def _chosen(entries: Entries, wanted: str | None, file: Path) -> np.ndarray:
+    """Return the one transformation, or the one that was named."""
+    if not entries:
+        raise FormatError("holds no transformation; check what it is")
+    if wanted is None:
+        if len(entries) > 1:
+            first, last = entries[0][0], entries[-1][0]
+            raise FormatError(
+                f"holds {len(entries)} transformations ('{first}' to '{last}'); "
+                f"name the one to take, as in '{file.name}#{first}'"
+            )
+        return entries[0][1]
+    found = [matrix for name, matrix in entries if name == wanted]
+    if len(found) != 1:
+        names = ", ".join(name for name, _ in entries[:6]) + (", ..." if len(entries) > 6 else "")
+        what = "no entry" if not found else f"{len(found)} entries"
+        raise FormatError(f"has {what} '{wanted}'; it holds {names or 'one transformation without a name'}")
+    return found[0]
+
+
+def _from_npy(data: bytes) -> Entries:
     stream = io.BytesIO(data)
     try:  # the header first: np.load would allocate whatever shape it promises
         version = np.lib.format.read_magic(stream)
@@ -85,30 +207,17 @@ def _from_npy(data: bytes) -> np.ndarray:
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
         shape, _, dtype = read_header(stream)
-        if shape != (4, 4) or dtype.kind not in "fiu":
+        several = len(shape) == 3 and shape[1:] == (4, 4) and 0 < shape[0] <= len(data)
+        if (shape != (4, 4) and not several) or dtype.kind not in "fiu":
             raise FormatError(f"holds a {shape} array of {dtype}; a transformation is (4, 4) numbers")
-        return np.load(io.BytesIO(data), allow_pickle=False).astype(np.float64)
-    except (ValueError, EOFError, OSError) as error:
+        matrices = np.load(io.BytesIO(data), allow_pickle=False).astype(np.float64).reshape(-1, 4, 4)
+    except FormatError:
+        raise
+    except Exception as error:  # NumPy's parser of headers raises whatever it meets
         raise FormatError(f"is not a NumPy array file ({_one_line(error)}); write it with np.save") from None
-
-
-def _from_json(data: bytes) -> np.ndarray:
-    try:
-        content: Any = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"is not JSON ({_one_line(error)}); write it again") from None
-    if isinstance(content, dict):
-        if "T_target_source" not in content:
-            raise FormatError("has no 'T_target_source'; put the 4 rows of 4 numbers under that name")
-        content = content["T_target_source"]
-    rows = content if isinstance(content, list) else []
-    numbers = [v for row in rows if isinstance(row, list) and len(row) == 4 for v in row]
-    if len(rows) != 4 or len(numbers) != 16 or not all(type(v) in (int, float) for v in numbers):
-        raise FormatError("'T_target_source' must be 4 rows of 4 numbers")
-    try:
-        return np.array(numbers, np.float64).reshape(4, 4)
-    except OverflowError:
-        raise FormatError("'T_target_source' holds a number that is too large") from None
+    if not several:
+        return [("", matrices[0])]
+    return [(str(number), matrix) for number, matrix in enumerate(matrices, 1)]
 
 
 def _rigid(matrix: np.ndarray) -> np.ndarray:
