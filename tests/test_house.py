@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import utopic_cli
+from tests.command_line import all_commands, parse
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -97,3 +98,36 @@ def test_usage_errors_exit_2_and_the_module_runs_like_the_command():
     assert result.stderr.splitlines() == [
         "utopic: error: No such option: --no-such-option; see 'utopic align --help'"
     ]
+
+
+COMMANDS = list(all_commands())
+
+
+@pytest.mark.parametrize(("path", "command"), COMMANDS, ids=[" ".join(path) for path, _ in COMMANDS])
+def test_every_command_shows_an_example_that_works_and_stands_under_a_heading(path, command):
+    found = re.findall(r"Example: \[bold\](.+?)\[/bold\]", command.help or "")
+    assert len(found) == 1, "let its docstring end in 'Example: [bold]utopic ...[/bold]'"
+    assert parse(found[0]) == path
+    assert command.rich_help_panel, "give it a rich_help_panel"
+    for option in command.params:
+        assert option.help or option.name == "help", f"{option.name}: say what it does"
+
+
+def test_the_workflow_runs_on_every_python_that_is_promised():
+    yaml = pytest.importorskip("yaml")
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8"))["jobs"]
+    matrix = jobs["test"]["strategy"]["matrix"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert f">={matrix['python'][0]}" == project["requires-python"]
+    assert len(matrix["python"]) == 4 and len(matrix["os"]) == 3
+    steps = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
+    assert any("pytest" in step for step in steps) and any("cmp" in step for step in steps)
+    assert all("-c constraints.txt" in step for step in steps if "pip install" in step and "pipx" not in step)
+
+
+def test_the_citation_names_the_paper():
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    yaml = pytest.importorskip("yaml")
+    card = yaml.safe_load(text)
+    assert card["cff-version"] == "1.2.0" and card["license"] == "Apache-2.0"
+    assert "UTOPIC" in card["preferred-citation"]["title"] and len(card["preferred-citation"]["authors"]) == 8

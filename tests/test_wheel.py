@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -72,6 +73,18 @@ def test_the_wheel_holds_weights_card_and_type_marker_and_no_tests(wheel):
     } <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "weights/"))]
+
+
+def test_two_builds_give_the_same_bytes(wheel, tmp_path):
+    """Whenever, wherever, and whatever the times of the files."""
+    copy = tmp_path / "copy"
+    caches = shutil.ignore_patterns(".*", "__pycache__", "build", "dist", "runs", "demo")
+    shutil.copytree(ROOT, copy, ignore=caches, copy_function=shutil.copyfile)
+    for path in copy.rglob("*.py"):
+        os.utime(path, (1e9, 1e9))
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, copy]
+    run(*command, cwd=tmp_path)
+    assert (tmp_path / wheel.name).read_bytes() == wheel.read_bytes()
 
 
 def test_the_installed_package_is_not_the_checkout(installed, tmp_path):

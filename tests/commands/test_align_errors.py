@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from utopic_cli.commands import outputs
-from utopic_cli.commands.align import _to_stdout
+from utopic_cli.commands.console import to_stdout
 from utopic_cli.errors import OutputError
 
 HEADER = (
@@ -267,7 +267,7 @@ class NobodyReads(io.StringIO):
 def test_a_matrix_that_nobody_reads_is_an_output_that_cant_be_written(monkeypatch, stdout):
     monkeypatch.setattr(sys, "stdout", stdout)
     with pytest.raises(OutputError, match=r"stdout: .*-o"):
-        _to_stdout(b"1 0 0 0\n")
+        to_stdout(b"1 0 0 0\n")
 
 
 def test_identity_sees_through_names(tmp_path):

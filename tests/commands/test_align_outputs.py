@@ -103,12 +103,35 @@ def test_coloured_clouds_carry_both_fields_at_every_point_and_are_redder_where_t
         scan = read_points(scans[0] if kind.startswith("source") else scans[1])
         np.testing.assert_array_equal(xyz(fields), xyz(scan))
         ramp = np.linspace(0, 1, len(scan["x"]), dtype=np.float32)
-        np.testing.assert_array_equal(fields["overlap"], ramp)
-        np.testing.assert_array_equal(fields["uncertainty"], ramp[::-1])
-        shown = fields[kind.split("_")[1]]
+        np.testing.assert_array_equal(fields["scalar_overlap"], ramp)
+        np.testing.assert_array_equal(fields["scalar_uncertainty"], ramp[::-1])
+        shown = fields["quality"]
+        np.testing.assert_array_equal(shown, fields["scalar_" + kind.split("_")[1]])
         redness = fields["red"].astype(int) - fields["blue"].astype(int)
         assert redness[np.argmax(shown)] > 100
         assert redness[np.argmin(shown)] < -50
+
+
+def test_coloured_clouds_keep_what_the_scans_file_says(cli, fake, scans, tmp_path):
+    header = scans[0].read_bytes().replace(b"uchar red", b"float intensity")
+    scans[0].write_bytes(header)
+    assert cli("align", *scans, "--clouds", tmp_path / "clouds").exit_code == 0
+    for kind in ("source_overlap", "source_uncertainty"):
+        fields = read_points(tmp_path / "clouds" / f"{kind}.ply")
+        np.testing.assert_array_equal(fields["scalar_intensity"], np.arange(60))
+
+
+def test_the_colour_map_is_that_of_clouds_and_page(cli, fake, scans, tmp_path):
+    out = tmp_path / "out"
+    assert cli("align", *scans, "--out-dir", out, "--colormap", "purple-yellow").exit_code == 0
+    fields = read_points(out / "source_overlap.ply")
+    lightest = fields["red"].astype(int) + fields["green"]
+    assert lightest.argmax() == fields["scalar_overlap"].argmax()
+    assert lightest.argmin() == fields["scalar_overlap"].argmin()
+    assert b"lighter = more likely to overlap" in (out / "source_overlap.ply").read_bytes()
+    assert "#fff03c" in (out / "report.html").read_text(encoding="utf-8")
+    refused = cli("align", *scans, "--clouds", tmp_path / "c", "--colormap", "rainbow")
+    assert refused.exit_code == 2 and "blue-red" in refused.stderr
 
 
 def test_the_page_names_both_files_holds_the_matrix_and_repeats_warnings(cli, fake, scans, tmp_path):
@@ -130,9 +153,9 @@ def test_merged_holds_both_scans_in_the_targets_frame(cli, fake, scans, tmp_path
     fields = read_points(tmp_path / "m.ply")
     source, target = xyz(read_points(scans[0])), xyz(read_points(scans[1]))
     np.testing.assert_array_equal(
-        xyz(fields)[fields["scan"] == 0], source @ QUARTER_TURN[:3, :3].T + QUARTER_TURN[:3, 3]
+        xyz(fields)[fields["scalar_scan"] == 0], source @ QUARTER_TURN[:3, :3].T + QUARTER_TURN[:3, 3]
     )
-    np.testing.assert_array_equal(xyz(fields)[fields["scan"] == 1], target)
+    np.testing.assert_array_equal(xyz(fields)[fields["scalar_scan"] == 1], target)
 
 
 def test_what_could_not_be_measured_is_null_with_a_reason(cli, fake, scans, tmp_path):

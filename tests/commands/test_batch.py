@@ -31,7 +31,7 @@ def stubbed(monkeypatch):
         seen.append(asked)
         return run(asked, progress=progress, make_task=make_stub)
 
-    monkeypatch.setattr(room, "_weights", lambda options: {"name": "stub", "sha256": "stub"})
+    monkeypatch.setattr(room, "weights_of", lambda options: {"name": "stub", "sha256": "stub"})
     monkeypatch.setattr(room, "run_batch", run_stubbed)
     return seen
 
@@ -83,6 +83,8 @@ def test_parts_and_nothing_have_exit_codes_of_their_own(cli, stubbed, tmp_path):
         (["scans", "--out-dir", "out", "--merge-voxel", "1"], 2, "--merge-voxel needs --merge"),
         (["scans", "--out-dir", "scans"], 2, "choose another --out-dir"),
         (["scans", "--out-dir", "out", "--resume", "--overwrite"], 2, "choose one"),
+        (["scans", "--out-dir", "out", "--cluster", "tcp://x:1", "--workers", "2"], 2, "choose one"),
+        (["scans", "--out-dir", "out", "--cluster", "nonsense"], 4, "nonsense: no Dask scheduler answers"),
         (["nowhere", "--out-dir", "out"], 4, "no such file or folder"),
         (["scans/a.ply", "--out-dir", "out"], 4, "at least two"),
         (["scans", "--out-dir", "out", "--pairs", "none.csv"], 4, "none.csv: no such file"),
@@ -93,11 +95,64 @@ def test_mistakes_are_told_in_one_line_before_any_work(
     cli, stubbed, tmp_path, monkeypatch, arguments, code, said
 ):
     monkeypatch.chdir(tmp_path)
+    if "--cluster" in arguments:
+        pytest.importorskip("distributed")
     write_scans(tmp_path / "scans", ["a.ply", "b.ply"])
     result = cli("batch", *arguments)
     assert result.exit_code == code
     assert said in result.stderr and len(result.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_bad_inputs_are_named_with_their_exit_codes(cli, stubbed, tmp_path):
+    """Equal stems, copies, files given twice, odd names, files that are no scans, lists that are wrong."""
+    write_scans(tmp_path / "scans", ["a b.ply", "[c].ply"])
+    write_scans(tmp_path / "more", ["a b.ply"], seed=1)
+    truths = [json.loads((tmp_path / name / "truth.json").read_text()) for name in ("scans", "more")]
+    (tmp_path / "scans" / "copy.ply").write_bytes((tmp_path / "scans" / "[c].ply").read_bytes())
+    listed = tmp_path / "pairs.csv"
+    listed.write_text("source,target\na b,[c]\n[c],d\n")
+    inputs = (tmp_path / "scans", tmp_path / "more", tmp_path / "scans" / "a b.ply")
+    result = cli("batch", *inputs, "--out-dir", tmp_path / "out", "--pairs", listed)
+    assert result.exit_code == 4 and "pairs.csv: line 3 names 'd'" in result.stderr
+    assert truths[0].keys() > truths[1].keys() and not (tmp_path / "out").exists()
+    result = cli("batch", *inputs, "--out-dir", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    for said in (
+        "copy.ply: is a copy of [c]; it gets the same place",
+        "a b.ply: is given twice; it is used once",
+        "more/a b.ply: is called a b.ply here",
+        "4 of 4 scans placed, in one group",
+    ):
+        assert said in " ".join(result.stderr.split())
+    for name in ("x.ply", "y.ply"):
+        (tmp_path / "more" / name).write_text("nothing")
+    junk = [tmp_path / "more" / name for name in ("x.ply", "y.ply")]
+    result = cli("batch", *junk, "--out-dir", tmp_path / "none")
+    assert result.exit_code == 4 and "none of 2 scans can be read; the first: " in result.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_told_in_one_line_and_nothing_of_a_file_is_left(cli, stubbed, tmp_path, monkeypatch):
+    """The pairs are done; the merged cloud no longer fits."""
+    from utopic_cli.io import output
+
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply"])
+    create = output._create
+
+    def full(path):
+        if path.parent == tmp_path / "out":
+            os.close(create(path))
+            return os.open("/dev/full", os.O_WRONLY)
+        return create(path)
+
+    monkeypatch.setattr(output, "_create", full)
+    out = tmp_path / "out"
+    result = cli("batch", tmp_path / "scans", "--out-dir", out, "--merge")
+    assert result.exit_code == 5
+    assert "merged.ply" in result.stderr and "the disk is full" in result.stderr
+    assert sorted(path.name for path in out.iterdir()) == ["pairs", "scans"]
+    monkeypatch.undo()
 
 
 def test_a_dry_run_prints_the_plan_and_writes_nothing(cli, stubbed, tmp_path):
@@ -119,7 +174,7 @@ from functools import partial
 from tests.multiway.stubs import make_stub
 from utopic_cli.multiway import batch as room
 run = room.run_batch
-room._weights = lambda options: {"name": "stub", "sha256": "stub"}
+room.weights_of = lambda options: {"name": "stub", "sha256": "stub"}
 room.run_batch = lambda asked, progress=None: run(
     asked, progress=progress, make_task=partial(make_stub, "", True, float(os.environ["PAUSE"]))
 )

@@ -2,10 +2,20 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import sys
+from pathlib import Path
 
 import utopic_cli
 from utopic_cli.commands import info
-from utopic_cli.model.weights import bundled_weights
+from utopic_cli.model.bundled import bundled_weights
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_info_says_versions_devices_and_the_weights_hash(cli, monkeypatch):
@@ -30,7 +40,7 @@ def test_a_damaged_weights_file_is_called_so(cli, monkeypatch, tmp_path):
     (tmp_path / "broken.json").write_text(json.dumps({"model": {}, "sha256": "0" * 64}))
     (tmp_path / "lonely.safetensors").write_bytes(b"without a card")
     found = {name: tmp_path / f"{name}.safetensors" for name in ("broken", "lonely")}
-    monkeypatch.setattr("utopic_cli.model.weights.bundled_weights", lambda: found)
+    monkeypatch.setattr("utopic_cli.model.bundled.bundled_weights", lambda: found)
     monkeypatch.setattr(info, "OPTIONAL", {})
     weights = json.loads(cli("info", "--json").stdout)["weights"]
     assert weights["broken"]["intact"] is False
@@ -47,3 +57,19 @@ def test_an_optional_part_that_is_missing_or_broken_says_what_to_do(monkeypatch)
     assert "apt-get install" in info._optional("open3d")
     monkeypatch.setattr(info, "_version", lambda name: "not installed")
     assert "pip install" in info._optional("tensorboard")
+
+
+def test_every_extra_is_named_with_the_command_that_installs_it():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for extra, packages in project["optional-dependencies"].items():
+        for package in packages if extra != "dev" else ():
+            name = re.split(r"[^\w-]", package)[0]
+            assert f"utopic-cli[{extra}]" in info.OPTIONAL[name]
+
+
+def test_the_environment_that_matters_is_shown(cli, monkeypatch):
+    monkeypatch.setattr(info, "OPTIONAL", {})
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    facts = json.loads(cli("info", "--json").stdout)
+    assert facts["environment"]["OMP_NUM_THREADS"] == "1"
+    assert "CPUs" in facts["devices"]["cpu"]

@@ -24,7 +24,7 @@ from utopic_cli.multiway.plan import BatchRequest, plan_batch
 def light(monkeypatch):
     """No network: its weights' hash is all that a batch itself needs of it."""
     monkeypatch.setattr(
-        room, "_weights", lambda options: {"name": options.weights, "sha256": options.weights}
+        room, "weights_of", lambda options: {"name": options.weights, "sha256": options.weights}
     )
 
 
@@ -109,6 +109,10 @@ def test_bad_files_are_named_and_the_rest_is_done(tmp_path):
     assert [(entry["scan"], "broken.ply" in entry["reason"]) for entry in content["left_out"]] == [
         ("broken", True)
     ]
+    rows = list(csv.DictReader((tmp_path / "out" / "summary.csv").open()))
+    told = {row["name"]: row for row in rows}
+    assert told["broken"]["status"] == "unreadable" and "broken.ply" in str(told["broken"])
+    assert told["copy"]["status"] == "copy"
     assert [entry["file"].endswith("README.txt") for entry in content["passed_over"]] == [True]
     places = {entry["scan"]: entry["T_world_scan"] for entry in content["scans"]}
     assert places["copy"] == places["b"] is not None
@@ -224,7 +228,7 @@ def test_a_disk_that_fills_up_ends_the_batch_with_what_is_done(tmp_path, monkeyp
     assert len(list((tmp_path / "out" / "pairs").glob("*.json"))) == 2
     monkeypatch.undo()
     monkeypatch.setattr(
-        room, "_weights", lambda options: {"name": options.weights, "sha256": options.weights}
+        room, "weights_of", lambda options: {"name": options.weights, "sha256": options.weights}
     )
     assert run(tmp_path, resume=True).resumed == 2
 

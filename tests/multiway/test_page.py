@@ -27,13 +27,13 @@ def outcome(tmp_path_factory):
     folder = tmp_path_factory.mktemp("batch")
     write_scans(folder / "scans", NAMES, objects=2)
     (folder / "scans" / "broken.ply").write_text("ply")
-    weights, room._weights = room._weights, lambda options: {"name": "stub", "sha256": "stub"}
+    weights, room.weights_of = room.weights_of, lambda options: {"name": "stub", "sha256": "stub"}
     try:
         found = room.run_batch(
             BatchRequest((folder / "scans",), folder / "out"), make_task=partial(make_stub)
         )
     finally:
-        room._weights = weights
+        room.weights_of = weights
     scans = [
         replace(entry, file=replace(entry.file, name=HOSTILE)) if entry.file.name == "hostile" else entry
         for entry in found.scans

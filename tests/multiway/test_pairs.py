@@ -14,13 +14,15 @@ def test_the_fixed_ways_of_choosing():
     assert choice.pairs_to_first([2, 5, 7]) == [(5, 2), (7, 2)]
 
 
-def test_similar_scans_are_paired_and_the_chain_is_kept():
+def test_similar_scans_are_paired_and_the_order_is_probed():
     rng = np.random.default_rng(0)
     kind = {scan: scan % 3 for scan in range(30)}
     descriptors = {scan: 5.0 * np.eye(3)[kind[scan]] + 0.1 * rng.standard_normal(3) for scan in kind}
     pairs = choice.similar_pairs(descriptors)
     assert all(later > earlier for later, earlier in pairs)
-    assert {(scan, scan - 1) for scan in range(1, 30)} <= set(pairs)
+    probes = [pair for pair in pairs if pair[0] - pair[1] == 1]
+    assert len(probes) == choice.PROBES
+    assert (1, 0) in probes and (29, 28) in probes
     alike = [pair for pair in pairs if pair[0] - pair[1] > 1]
     assert len(alike) >= 30 and all(kind[a] == kind[b] for a, b in alike)
     assert len(pairs) < 30 * 29 / 4
@@ -49,3 +51,19 @@ def test_pairs_without_overlap_predict_no_loops():
     descriptors = {scan: np.array([float(scan)]) for scan in range(3)}
     assert choice.further_pairs(world.model(), descriptors, set(world.records)) == []
     assert report(np.eye(4))["trusted"]
+
+
+def test_neighbours_in_order_are_tried_where_the_order_means_something():
+    """Forty scans of one object in a row, or of objects in turn; only the probes tell."""
+    for objects, ordered in ((1, True), (8, False)):
+        world = World(40, objects=objects)
+        descriptors = {scan: np.array([scan % objects, world.rng.uniform()]) for scan in range(40)}
+        for source, target in choice.similar_pairs(descriptors):
+            right = world.object[source] == world.object[target]
+            world.pair(source, target, right=right, trusted=right, confidence=0.97 if right else 0.01)
+        chain = {(scan, scan - 1) for scan in range(1, 40)}
+        assert not chain <= set(world.records)
+        more = choice.further_pairs(world.model(), descriptors, set(world.records))
+        assert (chain <= set(more) | set(world.records)) == ordered
+        if not ordered:  # a few of them are alike, too
+            assert len(chain & set(more)) < 6

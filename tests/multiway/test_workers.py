@@ -18,6 +18,8 @@ def work(job):
         os.kill(os.getpid(), signal.SIGKILL)
     if job == "hang":
         time.sleep(1000)
+    if job == "rest":
+        time.sleep(1.0)
     if job == "refuse":
         raise InputError("no good\nat all")
     if job == "bug":

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from utopic_cli import __version__
 from utopic_cli.config import AlignOptions
-from utopic_cli.errors import InputError
+from utopic_cli.errors import InputError, UsageError
 from utopic_cli.io.output import write_together
 from utopic_cli.multiway import folder
 from utopic_cli.multiway import pairs as choice
@@ -22,6 +22,7 @@ from utopic_cli.multiway.lock import locked
 from utopic_cli.multiway.merge import write_merged
 from utopic_cli.multiway.model import Model, build_model
 from utopic_cli.multiway.outcome import BatchOutcome, ScanEntry, pair_name
+from utopic_cli.multiway.pace import Pace, Progress
 from utopic_cli.multiway.page import batch_page
 from utopic_cli.multiway.plan import BatchPlan, BatchRequest, first_pairs, plan_batch
 from utopic_cli.multiway.scans import ScanFile
@@ -29,7 +30,9 @@ from utopic_cli.multiway.tables import poses_csv, poses_json, poses_txt, summary
 from utopic_cli.multiway.tasks import DescribeJob, RegisterJob, ScanRef, make_worker
 from utopic_cli.multiway.workers import Task, Workers
 
-Progress = Callable[[str], None]
+if TYPE_CHECKING:
+    from utopic_cli.multiway.cluster import Cluster
+
 Record = dict[str, Any]
 
 RECORD_VERSION = 2
@@ -53,10 +56,10 @@ def run_batch(
         What it came to; its ``exit_code`` says whether all scans connect.
 
     Raises:
-        InputError: no scan can be read, or the weights can't be used.
+        InputError: no scan can be read, the weights can't be used, or the cluster can't.
         OutputError: a file can't be written, an earlier batch is in the way, or another is at
             work in ``out_dir``. What is done stays.
-        UsageError: options contradict each other.
+        UsageError: options contradict each other, or a part that one needs is not installed.
     """
     return _Batch(request, progress or (lambda step: None), make_task).run()
 
@@ -71,8 +74,9 @@ class _Batch:
         self._request = request
         self._options = options
         self._progress = progress
-        self._make_task = make_task or partial(make_worker, options)
+        self._make_task = make_task
         self._resumed = 0
+        self._waited_s = 0.0
 
     def run(self) -> BatchOutcome:
         """Do everything, in order."""
@@ -81,26 +85,40 @@ class _Batch:
         self._progress("looking at the scans")
         plan = plan_batch(request)
         self._files = plan.scans.scans
-        self._weights = _weights(self._options)
-        folder.make_folder(request.out_dir)
-        with locked(request.out_dir):
-            if not (request.resume or request.overwrite):
-                folder.check_earlier(request.out_dir)
-            self._journal = Journal(request.out_dir)
-            folder.sweep(request.out_dir)
-            if request.overwrite:
-                # First the mark of a whole set, which it no longer is.
-                (request.out_dir / "poses.json").unlink(missing_ok=True)
-                self._journal.clear()
-            with Workers(
-                self._make_task, request.workers, request.timeout_s, self._options.threads
-            ) as workers:
-                self._workers = workers
+        self._weights = weights_of(self._options)
+        with self._staff() as workers:
+            self._workers = workers
+            folder.make_folder(request.out_dir)
+            with locked(request.out_dir):
+                if not (request.resume or request.overwrite):
+                    folder.check_earlier(request.out_dir)
+                self._journal = Journal(request.out_dir)
+                folder.sweep(request.out_dir)
+                if request.overwrite:
+                    # First the mark of a whole set, which it no longer is.
+                    (request.out_dir / "poses.json").unlink(missing_ok=True)
+                    self._journal.clear()
                 described = self._describe(plan)
                 model, records = self._align(plan, described)
-            outcome = self._outcome(plan, described, model, records, time.monotonic() - begin)
-            self._write(outcome)
+                workers.close()  # merging can do with their memory
+                outcome = self._outcome(plan, described, model, records, time.monotonic() - begin)
+                self._write(outcome)
         return outcome
+
+    def _staff(self) -> Workers | Cluster:
+        """Return who does the jobs: processes here, or those of a cluster."""
+        make_task = self._make_task or partial(make_worker, self._options, __version__, self._weights["card"])
+        limits = (self._request.timeout_s, self._options.threads)
+        if self._request.cluster is None:
+            return Workers(make_task, self._request.workers, *limits)
+        try:
+            from utopic_cli.multiway.cluster import Cluster
+        except ImportError as error:
+            raise UsageError(
+                f"--cluster needs Dask ({error}); install it: pip install 'utopic-cli[cluster]'"
+            ) from error
+        self._progress("reaching the cluster")
+        return Cluster(self._request.cluster, make_task, *limits)
 
     def _describe(self, plan: BatchPlan) -> dict[int, Record]:
         """Describe every usable scan; records by number."""
@@ -159,7 +177,8 @@ class _Batch:
         if kind == "pairs":
             self._resumed += len(records)
         left = [i for i in range(len(jobs)) if i not in records]
-        pace = _Pace(kind, len(jobs), len(left), self._progress)
+        pace = Pace(kind, len(jobs), len(left), self._progress)
+        begin = time.monotonic()
         for place, outcome in self._workers.run([jobs[i] for i in left]):
             i = left[place]
             status = "done" if outcome.problem is None else "refused" if outcome.lasting else "failed"
@@ -172,6 +191,7 @@ class _Batch:
                 record[CONTENT[kind]] = outcome.result
             records[i] = self._journal.commit(kind, names[i], marks[i], record)
             pace.step(names[i])
+        self._waited_s += time.monotonic() - begin
         return [records[i] for i in range(len(jobs))]
 
     def _mark(self, *content: Any) -> str:
@@ -224,6 +244,7 @@ class _Batch:
             asdict(self._options),
             self._request.pairs,
             seconds,
+            self._waited_s,
             self._resumed,
         )
 
@@ -259,35 +280,17 @@ class _Batch:
                 path.unlink(missing_ok=True)
 
 
-class _Pace:
-    """Says how much is done and about how long the rest takes, at the pace so far."""
+def weights_of(options: AlignOptions) -> dict[str, str]:
+    """Make sure that the network can be loaded before any work, and say which it is.
 
-    def __init__(self, kind: str, total: int, left: int, progress: Progress) -> None:
-        self._kind = kind
-        self._total = total
-        self._before = total - left
-        self._done = 0
-        self._begin = time.monotonic()
-        self._progress = progress
-        if left:
-            progress(f"{self._before}/{total} {kind}")
+    Keys: ``name``, ``sha256``, ``card``: the fingerprint of the card, which holds the verdict's calibration.
 
-    def step(self, name: str) -> None:
-        """Count one more."""
-        self._done += 1
-        each = (time.monotonic() - self._begin) / self._done
-        done = self._before + self._done
-        minutes, seconds = divmod(round(each * (self._total - done)), 60)
-        left = f"{each:.1f} s each, about {minutes}:{seconds:02d} left"
-        self._progress(f"{done}/{self._total} {self._kind}, {left}: {name}")
-
-
-def _weights(options: AlignOptions) -> dict[str, str]:
-    """Make sure that the network can be loaded before any work, and say which it is."""
+    Raises:
+        InputError: the weights or the device can't be used.
+    """
     from utopic_cli.bridge import load_network
 
     _, card = load_network(options.weights, options.device)
-    # The card holds the calibration of the verdict, which is not in the weights' own hash.
     return {"name": str(card["name"]), "sha256": str(card["sha256"]), "card": fingerprint(card)}
 
 

@@ -15,6 +15,8 @@ import numpy as np
 
 from utopic_cli.io import lzf
 from utopic_cli.io.ascii_table import is_number, parse_table
+from utopic_cli.io.las import las_block
+from utopic_cli.io.las_header import parse_header as las_header
 from utopic_cli.io.ply_header import parse_header
 from utopic_cli.io.records import FormatError
 
@@ -72,6 +74,8 @@ def find_fields(sample: bytes, kind: str) -> Fields:
         return _pcd_fields(sample)
     if kind == "obj":
         return _obj_fields(sample)
+    if kind in ("las", "laz"):
+        return _las_fields(sample)
     return _text_fields(sample) if kind in ("xyz", "txt", "pts", "asc", "csv") else Fields()
 
 
@@ -134,6 +138,22 @@ def _ply_fields(sample: bytes) -> Fields:
         return {name: table[vertex.properties[places[name]].name] for name in names}
 
     return Fields({name: vertex.properties[i].dtype for name, i in places.items()}, read)
+
+
+def _las_fields(sample: bytes) -> Fields:
+    found = las_header(sample, whole=False).fields(sample)
+    known = list(found)
+    places = {name: found[known[i]] for name, i in _named(known).items()}
+
+    def read(data: bytes, records: int, names: Sequence[str]) -> Values:
+        header, block = las_block(data)
+        if header.count != records:
+            raise _changed()
+        step = (header.record_size,)
+        wanted = {name: places[name] for name in names}
+        return {n: np.ndarray((records,), f.dtype, block, f.place, step) for n, f in wanted.items()}
+
+    return Fields({name: place.dtype for name, place in places.items()}, read)
 
 
 def _pcd_fields(sample: bytes) -> Fields:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 
@@ -58,6 +59,9 @@ class _Join:
     agreeing: tuple[int, ...] = ()  # the edges that say so
 
 
+_NONE = _Join(-np.inf, np.eye(4))
+
+
 def find_groups(
     edges: Sequence[Edge], beliefs: Sequence[Belief], shapes: Mapping[int, ScanShape]
 ) -> list[Group]:
@@ -81,12 +85,22 @@ def find_groups(
         pair: _best_join(pair, votes, edges, beliefs, shapes, groups, home, links)
         for pair, votes in across.items()
     }
-    while joins:
-        (first, second), join = max(
-            ((pair, join) for pair, join in joins.items()), key=lambda item: (item[1].log_odds, item[0])
-        )
-        if join.log_odds == -np.inf:
+    beside: dict[int, set[int]] = defaultdict(set)
+    for first, second in across:
+        beside[first].add(second)
+        beside[second].add(first)
+    # The best join comes first, of equal ones that of the last groups. An entry of a join that has
+    # changed since is passed over.
+    heap = [(-join.log_odds, -first, -second) for (first, second), join in joins.items()]
+    heapify(heap)
+    while heap:
+        worth, *negative = heappop(heap)
+        first, second = (-number for number in negative)
+        if worth == np.inf:
             break
+        join = joins.get((first, second), _NONE)
+        if join.log_odds != -worth:
+            continue
         kept, gone = groups[first], groups.pop(second)
         back = invert(join.motion)
         for scan, transformation in gone.T_group_scan.items():
@@ -97,16 +111,20 @@ def find_groups(
         for number in join.agreeing:
             edge = edges[number]
             links[edge.source][edge.target] = links[edge.target][edge.source] = edge.overlap
-        votes_of: dict[tuple[int, int], list[int]] = defaultdict(list)
-        for pair in [pair for pair in across if {first, second} & set(pair)]:
-            joins.pop(pair)
-            here, there = (first if scan == second else scan for scan in pair)
-            votes = across.pop(pair)
-            if here != there:
-                votes_of[_ordered(here, there)] += votes
-        for pair, votes in votes_of.items():
-            across[pair] = sorted(votes)
+        del joins[first, second], across[first, second]
+        beside[first].remove(second)
+        beside[second].remove(first)
+        for there in beside.pop(second):
+            across[_ordered(first, there)] += across.pop(_ordered(second, there))
+            joins.pop(_ordered(second, there))
+            beside[there].remove(second)
+            beside[there].add(first)
+            beside[first].add(there)
+        for there in beside[first]:
+            pair = _ordered(first, there)
+            across[pair].sort()
             joins[pair] = _best_join(pair, across[pair], edges, beliefs, shapes, groups, home, links)
+            heappush(heap, (-joins[pair].log_odds, -pair[0], -pair[1]))
     return sorted(groups.values(), key=lambda group: (-len(group.T_group_scan), min(group.T_group_scan)))
 
 
@@ -139,7 +157,7 @@ def _best_join(
     priors = np.array([edges[number].prior for number in votes])
     for_it = np.array([agreement(edges[n].prior, edges[n].rivals) for n in votes])
     trusted = np.array([edges[number].trusted for number in votes])
-    best = _Join(-np.inf, np.eye(4))
+    best = _NONE
     for seed in np.argsort(-priors - trusted, kind="stable")[:MOST_SEEDS].tolist():
         agrees = displacements(back @ motions[seed] @ there, moments) <= tolerance
         others = np.arange(len(votes)) != seed

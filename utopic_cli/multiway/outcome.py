@@ -58,6 +58,7 @@ class BatchOutcome:
         options: of the pairwise registration.
         pairs_mode: how the pairs were chosen.
         seconds: wall time of this run.
+        waited_s: of which jobs were waited for.
         resumed: pairs that were done before this run.
     """
 
@@ -70,6 +71,7 @@ class BatchOutcome:
     options: dict[str, Any]
     pairs_mode: str
     seconds: float
+    waited_s: float
     resumed: int
 
     def pair_name(self, source: int, target: int) -> str:

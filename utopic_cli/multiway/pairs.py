@@ -28,7 +28,12 @@ FEW_SCANS = 12
 """Up to this many scans ``auto`` tries all pairs: ranking them would save little."""
 
 NEAREST = 4
-"""``auto`` begins with each scan's most similar ones, this many, and its neighbours in order."""
+"""``auto`` begins with each scan's most similar ones, this many, and some neighbours in order."""
+
+PROBES, ORDERED = 20, 0.25
+"""So many neighbours in order, all over the batch, tell whether order means anything: whether at least
+this share of them may hold. Only then are the others worth their time.
+"""
 
 PAIRS_PER_SCAN = 10
 """``auto`` never tries more than this many pairs a scan."""
@@ -37,6 +42,7 @@ MOST_ROUNDS = 6
 PROMISING = 0.3  # chance of being right from which a pair predicts the overlap of others
 LEAST_PREDICTED_OVERLAP = 0.1
 TRIES_PER_GROUP = 3
+ROWS = 256  # of the table of distances at a time
 
 
 def every_pair(scans: Sequence[int]) -> list[Pair]:
@@ -56,26 +62,26 @@ def pairs_to_first(scans: Sequence[int]) -> list[Pair]:
 
 
 def similar_pairs(descriptors: Mapping[int, np.ndarray]) -> list[Pair]:
-    """Return ``auto``'s first pairs on many scans: the most similar ones, and neighbours in order.
+    """Return ``auto``'s first pairs on many scans: the most similar ones, and some neighbours in order.
 
     Args:
         descriptors: (D,) by scan.
     """
     scans = sorted(descriptors)
-    distance = _distances(descriptors)
-    pairs = {_ordered(*pair) for pair in zip(scans[1:], scans, strict=False)}
-    for row, scan in enumerate(scans):
-        order = [i for i in np.argsort(distance[row], kind="stable") if i != row]
-        pairs |= {_ordered(scan, scans[i]) for i in order[:NEAREST]}
+    pairs = set(_probes(scans))
+    for row, distance in enumerate(_distances(descriptors)):
+        distance[row] = np.inf
+        nearest = np.argsort(distance, kind="stable")[: min(NEAREST, len(scans) - 1)]
+        pairs |= {_ordered(scans[row], scans[i]) for i in nearest}
     return sorted(pairs)
 
 
 def further_pairs(model: Model, descriptors: Mapping[int, np.ndarray], tried: set[Pair]) -> list[Pair]:
-    """Return what ``auto`` tries next: pairs that close loops, and pairs between groups.
+    """Return what ``auto`` tries next: neighbours in order, pairs between groups, pairs that close loops.
 
-    Two scans that both lie on a third overlap by about the product of their overlaps with it; where
-    a pair is not yet confirmed by a loop, such a pair can do so. Groups that don't connect are
-    tried by their most similar scans.
+    Neighbours in order count if there is an order (see ``PROBES``). Groups that don't connect are tried
+    by their most similar scans. Two scans that both lie on a third overlap by about the product of
+    their overlaps with it; where a pair is not yet confirmed by a loop, such a pair can do so.
 
     Args:
         model: of the pairs so far.
@@ -84,7 +90,9 @@ def further_pairs(model: Model, descriptors: Mapping[int, np.ndarray], tried: se
     """
     known = {_ordered(*pair) for pair in tried}
     room = PAIRS_PER_SCAN * len(descriptors) - len(known)
-    pairs = list(dict.fromkeys([*_between(model, descriptors, known), *_closing(model.pairs, known)]))
+    chain = [pair for pair in _in_order(model, sorted(descriptors)) if pair not in known]
+    between = _between(model, descriptors, known)
+    pairs = list(dict.fromkeys([*chain, *between, *_closing(model.pairs, known)]))
     return pairs[: max(0, min(room, 2 * len(descriptors)))]
 
 
@@ -136,35 +144,50 @@ def _sound(path: Path, rows: Any) -> Iterator[list[str]]:
         raise InputError(f"{path}: line {rows.line_num} is no CSV ({error}); export it again") from None
 
 
+def _probes(scans: Sequence[int]) -> list[Pair]:
+    """Return some neighbours in order, evenly spread."""
+    chain = list(zip(scans[1:], scans, strict=False))
+    if not chain:
+        return []
+    return [chain[i] for i in np.unique(np.linspace(0, len(chain) - 1, PROBES).round().astype(int))]
+
+
+def _in_order(model: Model, scans: Sequence[int]) -> list[Pair]:
+    """Return all neighbours in order if the order of the scans means anything."""
+    probes = set(_probes(scans))
+    tried = [answer for answer in model.pairs if _ordered(answer.source, answer.target) in probes]
+    hold = sum(_may_hold(answer) for answer in tried)
+    return list(zip(scans[1:], scans, strict=False)) if hold and hold >= ORDERED * len(tried) else []
+
+
 def _between(model: Model, descriptors: Mapping[int, np.ndarray], known: set[Pair]) -> list[Pair]:
     """Return the most similar untried pairs between each group, or lone scan, and the others."""
     scans = sorted(descriptors)
-    distance = _distances(descriptors)
+    row_of = {scan: i for i, scan in enumerate(scans)}
     group_of = model.group_of()
     home = np.array([group_of.get(scan, -1 - i) for i, scan in enumerate(scans)])
-    untried = home[:, None] != home[None, :]
-    row_of = {scan: i for i, scan in enumerate(scans)}
+    tried: dict[int, list[int]] = defaultdict(list)
     for a, b in known:
         if a in row_of and b in row_of:
-            untried[row_of[a], row_of[b]] = untried[row_of[b], row_of[a]] = False
-    found: list[tuple[float, Pair]] = []
-    for part in np.unique(home):
-        rows = np.flatnonzero(home == part)
-        masked = np.where(untried[rows], distance[rows], np.inf)
-        best = np.argsort(masked, axis=None, kind="stable")[:TRIES_PER_GROUP]
-        for row, column in zip(*np.unravel_index(best, masked.shape), strict=True):
-            if np.isfinite(masked[row, column]):
-                pair = _ordered(scans[rows[row]], scans[column])
-                found.append((float(masked[row, column]), pair))
-    return [pair for _, pair in sorted(found)]
+            tried[row_of[a]].append(row_of[b])
+            tried[row_of[b]].append(row_of[a])
+    found: dict[int, list[tuple[float, Pair]]] = defaultdict(list)
+    for row, distance in enumerate(_distances(descriptors)):
+        distance[home == home[row]] = np.inf
+        distance[tried[row]] = np.inf
+        for other in np.argsort(distance, kind="stable")[:TRIES_PER_GROUP].tolist():
+            if np.isfinite(distance[other]):
+                found[home[row]].append((float(distance[other]), _ordered(scans[row], scans[other])))
+    return [
+        pair for _, pair in sorted(one for some in found.values() for one in sorted(some)[:TRIES_PER_GROUP])
+    ]
 
 
 def _closing(answers: Sequence[PairAnswer], known: set[Pair]) -> list[Pair]:
     """Return untried pairs that would close a loop with pairs not yet confirmed, surest overlap first."""
     neighbours: dict[int, dict[int, PairAnswer]] = defaultdict(dict)
     for answer in answers:
-        hopeless = answer.verdict in (FAILED, UNUSABLE)
-        if not hopeless and (answer.verdict == USED or (answer.prior or 0.0) >= PROMISING):
+        if _may_hold(answer):
             neighbours[answer.source][answer.target] = answer
             neighbours[answer.target][answer.source] = answer
     predicted: dict[Pair, float] = {}
@@ -182,16 +205,27 @@ def _closing(answers: Sequence[PairAnswer], known: set[Pair]) -> list[Pair]:
     return [pair for _, pair in sorted(likely)]
 
 
+def _may_hold(answer: PairAnswer) -> bool:
+    if answer.verdict in (FAILED, UNUSABLE):
+        return False
+    return answer.verdict == USED or (answer.prior or 0.0) >= PROMISING
+
+
 def _confirmed(answer: PairAnswer) -> bool:
     return answer.verdict == USED and answer.belief is not None and answer.belief.agree > 0
 
 
-def _distances(descriptors: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return (N, N) distances of descriptors, each of whose numbers counts by its spread in the batch."""
+def _distances(descriptors: Mapping[int, np.ndarray]) -> Iterator[np.ndarray]:
+    """Yield each scan's (N,) distances to all; each number of a descriptor counts by its spread in the batch.
+
+    They are made a few rows at a time: all N x N of them need not fit in memory.
+    """
     table = np.stack([descriptors[scan] for scan in sorted(descriptors)])
     table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), 1e-6)
     squares = np.square(table).sum(axis=1)
-    return np.sqrt(np.maximum(squares[:, None] + squares[None] - 2.0 * table @ table.T, 0.0))
+    for start in range(0, len(table), ROWS):
+        rows = slice(start, start + ROWS)
+        yield from np.sqrt(np.maximum(squares[rows, None] + squares - 2.0 * table[rows] @ table.T, 0.0))
 
 
 def _ordered(a: int, b: int) -> Pair:

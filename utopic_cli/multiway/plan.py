@@ -23,7 +23,8 @@ class BatchRequest:
         out_dir: where everything goes.
         pairs: ``auto``, ``all``, ``sequential``, ``to-first``, or the path of a CSV file.
         options: of the pairwise registration; threads are those of each worker, at least 1.
-        workers: processes.
+        workers: processes on this machine.
+        cluster: address of a Dask scheduler whose workers do the jobs instead, or None.
         timeout_s: seconds a pair may take.
         resume: go on with what is in ``out_dir``.
         overwrite: begin anew there, whatever is in it.
@@ -37,6 +38,7 @@ class BatchRequest:
     pairs: str = "auto"
     options: AlignOptions = field(default_factory=lambda: AlignOptions(threads=1))
     workers: int = 1
+    cluster: str | None = None
     timeout_s: float = 600.0
     resume: bool = False
     overwrite: bool = False

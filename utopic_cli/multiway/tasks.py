@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import socket
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from utopic_cli import __version__
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError
 from utopic_cli.io.scan import Scan, read_scan
+from utopic_cli.multiway.journal import fingerprint
 from utopic_cli.multiway.workers import NotNow
 
 MOST_POINTS_HELD = 6_000_000
@@ -52,16 +55,33 @@ class RegisterJob:
 Job = DescribeJob | RegisterJob
 
 
-def make_worker(options: AlignOptions) -> Callable[[Job], dict[str, Any]]:
+def make_worker(options: AlignOptions, version: str, card: str) -> Callable[[Job], dict[str, Any]]:
     """Return the task of one process: a job in, its record out.
 
     The task raises ``InputError`` for scans that can't be read or pairs that can't be registered, and
     ``NotNow`` for pairs of scans that could be read before.
+
+    Args:
+        options: of the pairwise registration.
+        version: of this package, that the batch runs with.
+        card: fingerprint of the weights' card there.
+
+    Raises:
+        NotNow: on this machine, or by now, one of these is another.
     """
     from utopic_cli.bridge import load_network
 
-    reader = _Reader(options.seed)
-    load_network(options.weights, options.device)  # before there is a job whose time it could take
+    _, own_card = load_network(options.weights, options.device)  # before there is a job to take its time
+    for kind, own, wanted in (
+        ("version of utopic-cli", __version__, version),
+        ("card of the weights", fingerprint(own_card), card),
+    ):
+        if own != wanted:
+            raise NotNow(
+                f"{socket.gethostname()} has another {kind} ({own[:12]}) than the batch ({wanted[:12]}); "
+                "install the same there"
+            )
+    reader = Reader(options.seed)
 
     def work(job: Job) -> dict[str, Any]:
         if isinstance(job, DescribeJob):
@@ -135,14 +155,20 @@ def register(source: Scan, target: Scan, options: AlignOptions) -> dict[str, Any
     return build_report(source, target, result)
 
 
-class _Reader:
+class Reader:
     """Reads scans, and remembers the last few."""
 
     def __init__(self, seed: int) -> None:
+        """Prepare; ``seed`` is that of points drawn from meshes."""
         self._seed = seed
         self._held: OrderedDict[Path, Scan] = OrderedDict()
 
     def __call__(self, wanted: ScanRef) -> Scan:
+        """Return a scan.
+
+        Raises:
+            InputError: it can't be read, or is not what it was.
+        """
         scan = self._held.pop(wanted.path, None)
         if scan is None:
             scan = read_scan(wanted.path, seed=self._seed)

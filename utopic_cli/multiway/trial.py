@@ -1,59 +1,34 @@
-"""A simulated folder of scans with a known answer, and how a batch does on it."""
+"""How a batch does on simulated scans whose answer is known, and how its work grows with them."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from utopic_cli import __version__
 from utopic_cli.config import AlignOptions
-from utopic_cli.geometry.rigid import apply, invert, random_rotation, relative_rotation_error_deg, rigid
+from utopic_cli.errors import OutputError, UsageError
+from utopic_cli.geometry.rigid import apply, invert, relative_rotation_error_deg
 from utopic_cli.io.output import write_atomically
-from utopic_cli.io.ply_writer import scalar_cloud_ply
-from utopic_cli.multiway.batch import run_batch
+from utopic_cli.multiway.batch import run_batch, weights_of
+from utopic_cli.multiway.drawn import answers_of, make_drawing
+from utopic_cli.multiway.journal import fingerprint
 from utopic_cli.multiway.model import USED
 from utopic_cli.multiway.outcome import BatchOutcome
 from utopic_cli.multiway.plan import BatchRequest
+from utopic_cli.multiway.simulated import Known, simulated
 from utopic_cli.multiway.workers import Task
-from utopic_cli.synthesis.procedural import procedural_mesh
-from utopic_cli.synthesis.scanner import range_scan
-from utopic_cli.synthesis.surface import bounding_diagonal, sample_surface
 
-VIEWS = 10
-"""Scans of each object, all the way round: neighbours are about 36 degrees apart."""
-
-FAMILIES = ("blended", "displaced")
-"""Objects that look different from every side: of others no program can tell the views apart."""
-
-POINTS = 9_000
-NOISE = 0.0008  # of the range, as a share of the object's diagonal
 WRONG_DEG, WRONG_SHARE = 5.0, 0.05
 """A pair that the final transformations put farther off than this (share of the diagonal) is wrong."""
-
-_RESOLUTION = 72
-_DENSE = 150_000
-_CELL = 0.012
-
-
-@dataclass(frozen=True)
-class Known:
-    """The answer for one scan.
-
-    Attributes:
-        thing: number of its object.
-        T_thing_scan: (4, 4) from the scan's frame to its object's.
-        diagonal: of the object's bounding box.
-    """
-
-    thing: int
-    T_thing_scan: np.ndarray
-    diagonal: float
 
 
 @dataclass(frozen=True)
@@ -63,11 +38,14 @@ class TrialRow:
     Attributes:
         scans: how many.
         objects: of how many objects.
+        drawn: whether pairs were answered by drawing, see ``drawn``, and not registered.
         pairs: tried.
         all_pairs: N (N - 1) / 2.
-        seconds: wall time of the batch.
-        largest_mb: most memory that any one of its processes had, MiB; None where the system
-            doesn't tell.
+        scan_s: mean wall time of describing a scan, seconds; 0 where all pairs are tried.
+        pair_s: mean wall time of registering a pair; where answers are drawn, that of all registered ones.
+        own_s: wall time of everything else: hashing, choosing, connecting, writing.
+        own_mb: most memory that this process ever had, MiB; None where the system doesn't tell.
+        worker_mb: most memory that any of its worker processes ever had.
         exact: every group is one object's scans, all of them.
         placed: scans that lie in a group.
         wrong_joins: scans in a group most of whose scans are another object's.
@@ -78,10 +56,14 @@ class TrialRow:
 
     scans: int
     objects: int
+    drawn: bool
     pairs: int
     all_pairs: int
-    seconds: float
-    largest_mb: float | None
+    scan_s: float
+    pair_s: float
+    own_s: float
+    own_mb: float | None
+    worker_mb: float | None
     exact: bool
     placed: int
     wrong_joins: int
@@ -89,92 +71,87 @@ class TrialRow:
     worst_deg: float
     worst_percent: float
 
+    @property
+    def work_s(self) -> float:
+        """What one worker takes for all scans and pairs, seconds; measured unless pairs are drawn."""
+        return self.scans * self.scan_s + self.pairs * self.pair_s
+
 
 def run_trials(
     counts: Sequence[int],
     options: AlignOptions,
     *,
+    drawn: Sequence[int] = (),
     workers: int = 1,
     seed: int = 0,
+    folder: Path | None = None,
     progress: Callable[[str], None] | None = None,
     make_task: Callable[[], Task] | None = None,
 ) -> list[TrialRow]:
-    """Simulate folders of so many scans and run a batch on each, in a temporary folder.
+    """Simulate folders of so many scans and run a batch on each.
 
     Args:
         counts: numbers of scans.
         options: of the pairwise registration.
+        drawn: further numbers, whose pairs get answers drawn from those of the pairs registered.
         workers: processes.
         seed: of objects, views, noise, poses and names.
+        folder: where all is kept, and gone on with by a later call; a temporary one if None.
         progress: called with a word on what is at work.
         make_task: see ``run_batch``.
+
+    Raises:
+        UsageError: the pairs registered don't tell what to draw.
+        OutputError: the folder can't be made.
     """
-    rows = []
-    for count in counts:
-        with TemporaryDirectory(prefix="utopic-") as folder:
-            known = make_scans(Path(folder) / "scans", count, np.random.default_rng([seed, count]), progress)
-            begin = time.monotonic()
+    rows: list[TrialRow] = []
+    answers: list[dict[str, Any]] = []
+    with TemporaryDirectory(prefix="utopic-") if folder is None else nullcontext(str(folder)) as kept:
+        for count in [*counts, *drawn]:
+            home = _made(Path(kept) / f"{count}-scans-seed-{seed}")
+            known = simulated(home, count, seed, progress)
+            drawing = len(rows) >= len(counts)
+            out = home / (f"drawn-{fingerprint(answers)[:8]}" if drawing else "out")
+            if drawing:
+                if {one["same"] for one in answers} != {True, False}:
+                    raise UsageError(
+                        "drawn answers need registered pairs of one object and of two: --scans 20"
+                    )
+                told = home / "answers.json"
+                write_atomically(told, json.dumps(answers).encode("ascii"), overwrite=True)
+                card = weights_of(options)["card"]
+                make_task = partial(
+                    make_drawing, options, __version__, card, str(home / "known.json"), str(told)
+                )
             request = BatchRequest(
-                (Path(folder) / "scans",), Path(folder) / "out", options=options, workers=workers
+                (home / "scans",), out, options=options, workers=workers, resume=True, overwrite=False
             )
             outcome = run_batch(request, progress=progress, make_task=make_task)
-            rows.append(score(outcome, known, time.monotonic() - begin))
+            row = score(outcome, known, _mean_seconds(out / "scans"))
+            if drawing:
+                pair_s = float(np.mean([one.pair_s for one in rows if not one.drawn]))
+                row = replace(row, drawn=True, pair_s=pair_s)
+            else:
+                answers += answers_of(outcome, known)
+            rows.append(row)
     return rows
 
 
-def make_scans(
-    folder: Path, count: int, rng: np.random.Generator, progress: Callable[[str], None] | None = None
-) -> dict[str, Known]:
-    """Write noisy scans of several objects, each in a pose of its own, their names in no order.
-
-    Args:
-        folder: is made.
-        count: of scans; ``VIEWS`` of each object, the rest shared out.
-        rng: source of randomness.
-        progress: called with a word on what is at work.
-
-    Returns:
-        The answers by name.
-    """
-    folder.mkdir(parents=True)
-    objects = max(1, round(count / VIEWS))
-    numbers = rng.permutation(count)
-    known: dict[str, Known] = {}
-    for thing in range(objects):
-        if progress is not None:
-            progress(f"simulating object {thing + 1} of {objects}")
-        vertices, faces = procedural_mesh(rng, _RESOLUTION, FAMILIES[thing % len(FAMILIES)])
-        points, normals = sample_surface(vertices, faces, _DENSE, rng)
-        diagonal = bounding_diagonal(points)
-        of_it = numbers[thing::objects]
-        for i, number in enumerate(of_it.tolist()):
-            angle = 2.0 * np.pi * (i + rng.uniform(-0.1, 0.1)) / len(of_it)
-            direction = np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.3, 0.5)])
-            view = range_scan(
-                points,
-                normals,
-                direction / np.linalg.norm(direction),
-                rng,
-                cell=_CELL,
-                count=POINTS,
-                noise=NOISE * diagonal,
-            )
-            pose = rigid(random_rotation(rng), rng.uniform(-2.0, 2.0, 3))
-            moved = apply(invert(pose), view.points)
-            name = f"scan-{number:05d}"
-            data = scalar_cloud_ply(moved, np.full(moved.shape, 128, np.uint8), {})
-            write_atomically(folder / f"{name}.ply", data, overwrite=False)
-            known[name] = Known(thing, pose, diagonal)
-    return known
+def _made(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: the folder can't be made ({error.strerror})") from None
+    return folder
 
 
-def score(outcome: BatchOutcome, known: dict[str, Known], seconds: float) -> TrialRow:
+def score(outcome: BatchOutcome, known: dict[str, Known], scan_s: float) -> TrialRow:
     """Compare a batch with the answers.
 
     Args:
         outcome: of the batch.
         known: the answers by name, of all its scans.
-        seconds: wall time it took.
+        scan_s: mean wall time of describing a scan, seconds.
     """
     answers = [known[entry.file.name] for entry in outcome.scans]
     objects = {answer.thing for answer in answers}
@@ -198,10 +175,14 @@ def score(outcome: BatchOutcome, known: dict[str, Known], seconds: float) -> Tri
     return TrialRow(
         scans=len(answers),
         objects=len(objects),
+        drawn=False,
         pairs=len(outcome.model.pairs),
         all_pairs=len(answers) * (len(answers) - 1) // 2,
-        seconds=seconds,
-        largest_mb=_largest_mb(),
+        scan_s=scan_s,
+        pair_s=float(np.mean([record["seconds"] for record in outcome.records.values()])),
+        own_s=outcome.seconds - outcome.waited_s,
+        own_mb=_most_mb("RUSAGE_SELF"),
+        worker_mb=_most_mb("RUSAGE_CHILDREN"),
         exact={frozenset(group) for group in groups} == {group for group in wanted if len(group) > 1},
         placed=sum(map(len, groups)),
         wrong_joins=strangers,
@@ -219,7 +200,7 @@ def to_json(rows: Sequence[TrialRow], options: AlignOptions, workers: int, seed:
         "options": asdict(options),
         "workers": workers,
         "seed": seed,
-        "rows": [asdict(row) for row in rows],
+        "rows": [{**asdict(row), "work_s": row.work_s} for row in rows],
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
@@ -235,14 +216,20 @@ def _error(outcome: BatchOutcome, answers: Sequence[Known], source: int, target:
     return relative_rotation_error_deg(found, right), gap / answers[source].diagonal
 
 
-def _largest_mb() -> float | None:
-    """Return the largest memory that this process or one it has waited for ever had."""
+def _mean_seconds(records: Path) -> float:
+    """Return how long the jobs of a folder of records took, on average."""
+    return float(
+        np.mean([json.loads(path.read_bytes())["seconds"] for path in sorted(records.glob("*.json"))])
+    )
+
+
+def _most_mb(whose: str) -> float | None:
+    """Return the most memory that this process, or one it has waited for, ever had."""
     try:
         import resource
     except ImportError:  # not on Windows
         return None
     import sys
 
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    most = max(resource.getrusage(kind).ru_maxrss for kind in kinds)
+    most = resource.getrusage(getattr(resource, whose)).ru_maxrss
     return most / (1 << 20 if sys.platform == "darwin" else 1 << 10)

@@ -93,9 +93,18 @@ class Workers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all processes."""
         for worker in self._workers:
             self._end(worker)
         self._workers.clear()
+
+    def kill(self) -> None:
+        """End all processes at once, from another thread: jobs at work are lost."""
+        for worker in list(self._workers):
+            worker.process.kill()
 
     def run(self, jobs: Sequence[Any]) -> Iterator[tuple[int, Outcome]]:
         """Do jobs; yields (index of the job, outcome) as they end, in any order."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from utopic_cli import __version__
+from utopic_cli.config import DEFAULT_COLOUR_MAP, ColourMapName
 from utopic_cli.io.colour import SOURCE_COLOUR, TARGET_COLOUR, colour_map
 from utopic_cli.io.transformation import CONVENTION, format_transformation
 from utopic_cli.page.charts import overlap_histogram, residual_histogram
@@ -54,6 +55,7 @@ def render(
     source_name: str,
     target_name: str,
     warnings: Iterable[str] = (),
+    colormap: ColourMapName = DEFAULT_COLOUR_MAP,
 ) -> str:
     """Make the page of one alignment.
 
@@ -64,13 +66,14 @@ def render(
         source_name: what to call the source; any text, escaped here.
         target_name: what to call the target.
         warnings: the readers' warnings, put before the result's.
+        colormap: the colours of overlap, uncertainty and residual.
 
     Returns:
         One HTML page that loads nothing from elsewhere: about 2 MB for scans of any size. The same
         arguments give the same text.
     """
     drawn = draw_clouds(result, source, target)
-    scene = build_scene(result, *drawn)
+    scene = build_scene(result, *drawn, colormap)
     views = _views(result, source, scene)
     script = _template("viewer.js")
     said = verdict(result)
@@ -79,7 +82,7 @@ def render(
         # Nothing but this very script runs, and nothing is loaded, whatever a name may hold.
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
         "style": _template("page.css"),
-        "colours": _colours(),
+        "colours": _colours(colormap),
         "source_name": _text(source_name),
         "target_name": _text(target_name),
         "verdict": said.kind,
@@ -131,7 +134,7 @@ def _views(result: RegistrationResult, source: PointCloud, scene: Scene) -> list
             1,
             "uncertainty",
             "How unsure the overlap is, stretched to 0..1 over the pair. "
-            "Red along the border of the overlap is usual.",
+            "Much along the border of the overlap is usual.",
         ),
         View(
             "Residual",
@@ -170,8 +173,9 @@ def _drawn(source: PointCloud, target: PointCloud, source_drawn: int, target_dra
     return f"Drawn: {said[0]}, {said[1]}."
 
 
-def _colours() -> str:
-    stops = ", ".join(_rgb(colour) for colour in colour_map(np.linspace(0.0, 1.0, 11)).tolist())
+def _colours(colormap: ColourMapName) -> str:
+    colours = colour_map(np.linspace(0.0, 1.0, 11), colormap).tolist()
+    stops = ", ".join(_rgb(colour) for colour in colours)
     return (
         f":root {{ --source: {_rgb(SOURCE_COLOUR)}; --target: {_rgb(TARGET_COLOUR)}; "
         f"--map: linear-gradient(90deg, {stops}); }}"

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from utopic_cli.config import DEFAULT_COLOUR_MAP, ColourMapName
 from utopic_cli.geometry.normals import estimate_normals, orient_normals
 from utopic_cli.geometry.rigid import apply, invert
 from utopic_cli.geometry.voxel import voxel_downsample
@@ -97,13 +98,19 @@ def _some(count: int, most: int, rng: np.random.Generator) -> np.ndarray:
     return np.arange(count) if count <= most else np.sort(rng.choice(count, most, replace=False))
 
 
-def build_scene(result: RegistrationResult, source: DrawnCloud, target: DrawnCloud) -> Scene:
+def build_scene(
+    result: RegistrationResult,
+    source: DrawnCloud,
+    target: DrawnCloud,
+    colormap: ColourMapName = DEFAULT_COLOUR_MAP,
+) -> Scene:
     """Put everything that the viewer draws into the frame of the view.
 
     Args:
         result: the answer, with overlap and uncertainty of every point of both scans.
         source: the points of the source to draw.
         target: the points of the target to draw.
+        colormap: the colours of overlap, uncertainty and residual.
     """
     answer = result.T_target_source
     aligned = apply(answer, source.points)
@@ -143,7 +150,7 @@ def build_scene(result: RegistrationResult, source: DrawnCloud, target: DrawnClo
             "target": _pose(np.eye(4), middles[1], origin, unit),
             "frames": frames,
             "turn": _numbers(_facing(np.concatenate([aligned, target.points]))),
-            "map": _encoded(colour_map(np.linspace(0.0, 1.0, LEVELS + 1))),
+            "map": _encoded(colour_map(np.linspace(0.0, 1.0, LEVELS + 1), colormap)),
         },
         apart=apart,
     )
