@@ -22,6 +22,7 @@ test: setup-dev lint
 
 lint: setup-dev
 	$(BIN)/ruff check utopic_cli tests
+	$(BIN)/ruff format --check utopic_cli tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 

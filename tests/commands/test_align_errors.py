@@ -162,6 +162,17 @@ def test_an_input_is_never_overwritten(cli, fake, scans, tmp_path, no_reading, l
     assert scans[0].read_bytes() == before
 
 
+@pytest.mark.parametrize("entry", ["", "#1"])
+def test_nor_is_the_file_that_the_initial_transformation_is_an_entry_of(
+    cli, fake, scans, tmp_path, no_reading, entry
+):
+    rows = tmp_path / "poses.tum"
+    rows.write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    result = cli("align", *scans, "--init", f"{rows}{entry}", "-o", rows, "--overwrite")
+    assert result.exit_code == 5
+    assert_one_line(result, str(rows), "input")
+
+
 def test_one_file_for_two_outputs_is_refused(cli, fake, scans, tmp_path, no_reading):
     result = cli("align", *scans, "--aligned", tmp_path / "x.ply", "--merged", tmp_path / "." / "x.ply")
     assert result.exit_code == 5

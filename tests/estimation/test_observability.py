@@ -150,3 +150,13 @@ def test_a_bar_slides_along_itself_and_a_notch_stops_it() -> None:
 def test_where_nothing_overlaps_nothing_is_stiff() -> None:
     one = surface(plane(np.random.default_rng(1)), np.array([0.0, 0.0, 9.0]))
     assert stiffness(one, one, rigid.rigid(np.eye(3), np.array([50.0, 0.0, 0.0])), 0.0, 1.0) == 0.0
+
+
+def test_a_line_turns_about_itself_unnoticed() -> None:
+    """Twelve points on a line overlap; turning about it moves none of them."""
+    line = np.zeros((12, 3))
+    line[:, 0] = np.linspace(0.0, 1.0, 12)
+    for along in (np.eye(3), rigid.rotation_from_vector(np.array([0.3, 0.5, 0.7]))):
+        normals = np.tile(along @ [0.0, 0.0, 1.0], (12, 1))
+        one = make_surface(PointCloud(line @ along.T, normals), VOXEL)
+        assert stiffness(one, one, np.eye(4), 1.0, 1.0) <= 0.0

@@ -44,6 +44,24 @@ def test_the_next_pairs_close_loops_and_reach_out_to_other_groups():
     assert choice.further_pairs(world.model(), descriptors, set(world.records)) == []
 
 
+def test_a_scan_left_over_is_tried_with_other_groups_than_those_that_refused_it():
+    """Scan 0 looks a little more like the scans of two strange objects than like those of its own."""
+    world = World(16, objects=3)
+    world.object[0] = 2
+    for source, target in [(b, a) for a in range(1, 16) for b in range(a + 1, 16)]:
+        if world.object[source] == world.object[target]:
+            world.pair(source, target)
+    for target in (3, 6):
+        world.pair(target, 0, right=False, trusted=False, confidence=0.01)
+    model = world.model()
+    assert model.alone == (0,)
+    looks = {0: 1.0, 1: 1.1, 2: 1.15}
+    descriptors = {scan: np.array([looks[world.object[scan]] + 1e-4 * scan]) for scan in range(1, 16)}
+    descriptors[0] = np.zeros(1)
+    more = choice.further_pairs(model, descriptors, set(world.records))
+    assert {1, 2} <= {world.object[source] for source, target in more if target == 0}
+
+
 def test_pairs_without_overlap_predict_no_loops():
     world = World(3)
     for pair in ((1, 0), (2, 1)):

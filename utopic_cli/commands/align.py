@@ -26,6 +26,7 @@ from utopic_cli.commands.console import (
     to_stdout,
 )
 from utopic_cli.commands.outputs import OutputPlan, check_outputs, make_outputs, plan_outputs, write_outputs
+from utopic_cli.commands.transformation import files_behind
 from utopic_cli.config import DEFAULT_COLOUR_MAP, AlignOptions, ColourMapName
 
 if TYPE_CHECKING:
@@ -227,7 +228,9 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
     """
     weights = Path(request.options.weights)
     inputs = [request.source, request.target, weights, weights.parent / f"{weights.stem}.json"]
-    check_outputs(request.plan, [*inputs, *([request.init] if request.init else [])], request.overwrite)
+    check_outputs(
+        request.plan, [*inputs, *files_behind([request.init] if request.init else [])], request.overwrite
+    )
     with console.progress() as progress:
         progress("loading libraries")
         from utopic_cli import pipeline

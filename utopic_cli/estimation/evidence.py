@@ -168,7 +168,7 @@ MOST_RESIDUAL = 10.0
 
 
 def _spread_of_residuals(median: float, high: float) -> float:
-    """The 90th percentile over the median; NaN where nothing has a counterpart."""
+    """The 90th percentile over the median; the most there is where nothing has a counterpart."""
     if high == 0.0:  # a perfect fit
         return 1.0
     return min(high / median, MOST_RESIDUAL) if median * MOST_RESIDUAL > high else MOST_RESIDUAL

@@ -35,6 +35,9 @@ answer may be off by."""
 LEAST_FIXED = 3
 """So many of the six motions are tried."""
 
+STILL = 1e-6
+"""A unit twist that moves the overlap by no more turns a line about itself: nothing notices that."""
+
 
 def observe(source: Surface, target: Surface, transformation: np.ndarray) -> Observability:
     """Look at the overlap of two aligned surfaces.
@@ -92,6 +95,8 @@ def stiffness(
     for twist in twists.vectors.T[:LEAST_FIXED]:
         omega, shift = twist[:3] / twists.radius, twist[3:]
         speed = np.sqrt(np.mean(np.sum((np.cross(omega, twists.arms) + shift) ** 2, axis=1)))
+        if speed < STILL:
+            return 0.0
         for amount in (DISPLACED * extent / speed, -DISPLACED * extent / speed):
             displaced = _screw(amount * omega, amount * (shift - np.cross(omega, twists.centre)))
             falls.append(likeness - meet(source, target, displaced @ transformation, alike).likeness)

@@ -42,6 +42,7 @@ MOST_ROUNDS = 6
 PROMISING = 0.3  # chance of being right from which a pair predicts the overlap of others
 LEAST_PREDICTED_OVERLAP = 0.1
 TRIES_PER_GROUP = 3
+TRIED_BEFORE = 0.1  # a pair tried between two groups makes the next one seem a tenth less alike
 ROWS = 256  # of the table of distances at a time
 
 
@@ -161,26 +162,45 @@ def _in_order(model: Model, scans: Sequence[int]) -> list[Pair]:
 
 
 def _between(model: Model, descriptors: Mapping[int, np.ndarray], known: set[Pair]) -> list[Pair]:
-    """Return the most similar untried pairs between each group, or lone scan, and the others."""
+    """Return the most promising untried pairs between each group, or lone scan, and the others.
+
+    Those are the most similar ones; each pair tried before between the same two groups counts as so much
+    less alike (see ``TRIED_BEFORE``), for what did not connect with one group may belong to another.
+    """
     scans = sorted(descriptors)
     row_of = {scan: i for i, scan in enumerate(scans)}
     group_of = model.group_of()
-    home = np.array([group_of.get(scan, -1 - i) for i, scan in enumerate(scans)])
+    _, home = np.unique([group_of.get(scan, -1 - i) for i, scan in enumerate(scans)], return_inverse=True)
     tried: dict[int, list[int]] = defaultdict(list)
+    tries: dict[int, Counter[int]] = defaultdict(Counter)
     for a, b in known:
         if a in row_of and b in row_of:
-            tried[row_of[a]].append(row_of[b])
-            tried[row_of[b]].append(row_of[a])
-    found: dict[int, list[tuple[float, Pair]]] = defaultdict(list)
+            for one, other in ((row_of[a], row_of[b]), (row_of[b], row_of[a])):
+                tried[one].append(other)
+                tries[int(home[one])][int(home[other])] += 1
+    found: dict[int, list[tuple[float, int, Pair]]] = defaultdict(list)  # distance, other group, pair
     for row, distance in enumerate(_distances(descriptors)):
         distance[home == home[row]] = np.inf
         distance[tried[row]] = np.inf
-        for other in np.argsort(distance, kind="stable")[:TRIES_PER_GROUP].tolist():
-            if np.isfinite(distance[other]):
-                found[home[row]].append((float(distance[other]), _ordered(scans[row], scans[other])))
-    return [
-        pair for _, pair in sorted(one for some in found.values() for one in sorted(some)[:TRIES_PER_GROUP])
-    ]
+        order = np.argsort(distance, kind="stable")
+        order = order[np.isfinite(distance[order])]
+        before = tries[int(home[row])]
+        nearest = order[np.unique(home[order], return_index=True)[1]].tolist()  # of each other group
+        nearest.sort(
+            key=lambda other: (distance[other] * (1 + TRIED_BEFORE * before[int(home[other])]), other)
+        )
+        for other in {*nearest[:TRIES_PER_GROUP], *order[:TRIES_PER_GROUP].tolist()}:
+            pair = _ordered(scans[row], scans[other])
+            found[int(home[row])].append((float(distance[other]), int(home[other]), pair))
+    chosen: list[tuple[float, Pair]] = []
+    for group, candidates in found.items():
+        counted = Counter(tries[group])
+        ranked = []
+        for distance_to, other, pair in sorted(candidates):
+            ranked.append((distance_to * (1 + TRIED_BEFORE * counted[other]), pair))
+            counted[other] += 1
+        chosen += sorted(ranked)[:TRIES_PER_GROUP]
+    return list(dict.fromkeys(pair for _, pair in sorted(chosen)))
 
 
 def _closing(answers: Sequence[PairAnswer], known: set[Pair]) -> list[Pair]:
