@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
+from contextlib import suppress
 from functools import partial
 
 import pytest
 
 from utopic_cli.errors import InputError
+from utopic_cli.multiway import workers
 from utopic_cli.multiway.workers import Workers
 
 
@@ -81,3 +84,24 @@ def test_processes_end_with_the_block():
         (_, outcome), *_ = workers.run(["a"])
     with pytest.raises(ProcessLookupError):
         os.kill(outcome.result["pid"], 0)
+
+
+def test_threads_that_start_processes_at_once_leave_the_environment_as_it_was(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    inside = threading.Barrier(2, timeout=0.3)
+    seen = []
+
+    def start():
+        with workers._thread_variables(1):
+            seen.append(os.environ["OMP_NUM_THREADS"])
+            with suppress(threading.BrokenBarrierError):  # two at once would meet here
+                inside.wait()
+                seen.append("met")
+
+    threads = [threading.Thread(target=start) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert seen == ["1", "1"]
+    assert "OMP_NUM_THREADS" not in os.environ

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -22,6 +22,7 @@ _Answer = tuple[dict[str, Any] | None, str | None, bool]  # result, problem, las
 
 # NumPy's and SciPy's linear algebra and torch heed one of these when they are loaded.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_STARTING = threading.Lock()  # the environment is the whole process', and a station has several threads
 
 
 START_LIMIT_S = 300.0
@@ -164,19 +165,11 @@ class Workers:
 
     def _start(self) -> _Worker:
         mine, theirs = self._context.Pipe()
-        before = {name: os.environ.get(name) for name in _THREADS}
-        os.environ.update(dict.fromkeys(_THREADS, str(self._threads)))
-        try:
-            process = self._context.Process(
-                target=_serve, args=(theirs, self._make_task, os.getpid()), daemon=True
-            )
+        process = self._context.Process(
+            target=_serve, args=(theirs, self._make_task, os.getpid()), daemon=True
+        )
+        with _thread_variables(self._threads):
             process.start()
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
         theirs.close()  # so that the end of the process is the end of the pipe
         worker = _Worker(process, mine)
         self._workers.append(worker)
@@ -189,6 +182,22 @@ class Workers:
         if worker.process.is_alive():
             worker.process.kill()
         worker.process.join()
+
+
+@contextmanager
+def _thread_variables(threads: int) -> Iterator[None]:
+    """Let processes that are started meanwhile read how many threads to take; one at a time."""
+    with _STARTING:
+        before = {name: os.environ.get(name) for name in _THREADS}
+        os.environ.update(dict.fromkeys(_THREADS, str(threads)))
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def _obituary(exit_code: int | None) -> str:
