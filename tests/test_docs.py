@@ -7,6 +7,7 @@ that is in no table is run, and so a new one that can't be run here fails until 
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -20,7 +21,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from tests.command_line import parse
+from tests.command_line import all_commands, parse
 from utopic_cli.cli import app
 from utopic_cli.io.ply_writer import scalar_cloud_ply
 from utopic_cli.synthesis.demo_object import demo_pair
@@ -45,6 +46,9 @@ PARSED = (
 )
 
 
+# Programs that the text names with options of their own.
+FOREIGN = ("dask ",)
+
 SHOWN = "utopic align demo/source.ply demo/target.ply --out-dir result"
 
 
@@ -52,15 +56,27 @@ def _make_knows(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
 
 
-def _tested_in(name: str, word: str) -> None:
-    assert word in (ROOT / "tests" / name).read_text(encoding="utf-8")
+def _pip_takes(command: str) -> None:
+    """All but the network and the installing, which ``test_wheel.py`` does."""
+    offline = ["--dry-run", "--no-deps", "--no-index", "--no-build-isolation"]
+    done = subprocess.run(
+        [sys.executable, "-m", *shlex.split(command), *offline],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0 and "Would install utopic-cli" in done.stdout, done.stderr
+
+
+PIP = "pip install -c constraints.txt ."
 
 
 # Commands that are not ours, and how they are checked.
 OTHERS = {
     "make demo": lambda: _make_knows("demo"),
     "make test": lambda: _make_knows("test"),
-    "pip install -c constraints.txt .": lambda: _tested_in("test_wheel.py", '"-m", "pip"'),
+    PIP: lambda: _pip_takes(PIP),
     "torchrun --nproc-per-node 2 -m utopic_cli train --out runs/two": lambda: parse(
         "utopic train --out runs/two"
     ),
@@ -80,7 +96,7 @@ def commands() -> list[Any]:
     found = []
     for page in PAGES:
         for language, text in fences(page):
-            assert language in ("", "text", "python", "toml"), (
+            assert language in ("", "text", "python", "toml", "json"), (
                 f"{page}: say in test_docs.py what {language} is"
             )
             lines = text.replace("\\\n", " ").splitlines() if not language else []
@@ -145,6 +161,13 @@ def test_the_programs_run(here: Path) -> None:
         exec(compile(text, str(page), "exec"), {})
 
 
+def test_the_json_is_sound() -> None:
+    for page in PAGES:
+        for language, text in fences(page):
+            if language == "json":
+                json.loads(text)
+
+
 def test_the_output_in_the_readme_is_that_of_its_command(here: Path) -> None:
     """But for the numbers, which are those of the whole demo."""
     blocks = list(fences(ROOT / "README.md"))
@@ -161,9 +184,29 @@ def _without_numbers(line: str) -> str:
     return re.sub(r"\d+(\.\d+)?", "#", line.replace("\\", "/").replace("over ", ""))
 
 
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+
+
+def _running_text(page: Path) -> str:
+    return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_options_named_alone_are_those_of_some_command(page: Path) -> None:
+    known = {option for _, command in all_commands() for option in _options(command)}
+    for code in re.findall(r"`([^`]+)`", _running_text(page)):
+        if not code.startswith(("utopic ", *FOREIGN)):
+            unknown = set(OPTION.findall(code)) - known
+            assert not unknown, f"{page.name}: `{code}`"
+
+
+def _options(command: Any) -> set[str]:
+    return {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_options_named_in_the_text_exist(page: Path) -> None:
-    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    text = _running_text(page)
     for found in re.finditer(r"`utopic ([^`]+)`", text):
         words = found[1].split()
         parser: Any = typer.main.get_command(app)
@@ -172,11 +215,9 @@ def test_options_named_in_the_text_exist(page: Path) -> None:
                 break
             assert words[0] in parser.commands, f"{page.name}: `utopic {found[1]}`"
             parser = parser.commands[words.pop(0)]
-        known = {option for one in parser.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
-        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", " ".join(words)):
-            assert option in known or not words[0].isalpha(), (
-                f"{page.name}: `utopic {found[1]}` has no {option}"
-            )
+        known = _options(parser)
+        for option in OPTION.findall(" ".join(words)):
+            assert option in known, f"{page.name}: `utopic {found[1]}` has no {option}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

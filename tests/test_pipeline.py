@@ -242,8 +242,11 @@ def test_scans_of_very_different_size_are_named(pair):
         (np.zeros((100, 3)), "source: all of its 100 points are equal"),
         (np.full((100, 3), np.nan), "source: none of its 100 points is finite"),
         (np.outer(np.arange(100.0), [1, 2, 3]), "source: all of its points lie on a line"),
+        (None, "source: a NoneType that is neither a path nor"),
+        (np.ones((100, 3)).astype(str), "source: a ndarray that is neither a path nor"),
+        (np.ones((100, 3), complex), "source: a ndarray that is neither a path nor"),
     ],
-    ids=["two columns", "all equal", "all NaN", "a line"],
+    ids=["two columns", "all equal", "all NaN", "a line", "nothing", "words", "complex"],
 )
 def test_arrays_that_cannot_be_used_are_explained(pair, points, message):
     with pytest.raises(InputError, match=message):
@@ -251,9 +254,42 @@ def test_arrays_that_cannot_be_used_are_explained(pair, points, message):
 
 
 def test_unknown_options_are_explained(pair):
-    with pytest.raises(UsageError, match="known options: weights, points"):
+    with pytest.raises(UsageError, match=r"unknown option voxel; known options: weights, points.*initial"):
         align(pair.source.points, pair.target.points, voxel=3)
     with pytest.raises(UsageError, match="no such solver; choose auto"):
         align(pair.source.points, pair.target.points, solver="magic")
+    with pytest.raises(UsageError, match="refine is 'no'; give True or False"):
+        align(pair.source.points, pair.target.points, refine="no")
+    with pytest.raises(UsageError, match="points is True; give a whole number"):
+        align(pair.source.points, pair.target.points, points=True)
+    with pytest.raises(InputError, match="initial transformation is a str; give a"):
+        align(pair.source.points, pair.target.points, initial="T.txt")
     with pytest.raises(InputError, match="no bundled weights of that name"):
         align(pair.source.points, pair.target.points, weights="absent")
+
+
+def test_values_and_indices_are_those_of_the_array_that_was_given(pair):
+    """Rows that are not finite keep their place, so that a caller's other columns still fit."""
+    holes = np.insert(pair.source.points, [0, 5, 5], np.nan, axis=0)
+    options = {"points": np.int64(300), "seed": np.int32(0), "threads": 1}
+    whole = align(pair.source.points, pair.target.points, **options)
+    found = align(holes, pair.target.points.tolist(), initial=np.eye(4).tolist(), **options)
+    finite = np.isfinite(holes).all(axis=1)
+    assert found.source_overlap.shape == found.source_uncertainty.shape == (len(holes),)
+    assert np.array_equal(np.isfinite(found.source_overlap), finite)
+    assert found.warnings == (f"source: 3 of {len(holes)} points are NaN or infinite and were left out",)
+    assert whole.warnings == () and len(whole.source_overlap) == len(pair.source)
+    pairs = found.correspondences
+    assert finite[pairs.source_indices].all() and pairs.target_indices.max() < len(pair.target)
+    moved = holes[pairs.source_indices] @ found.T_target_source[:3, :3].T + found.T_target_source[:3, 3]
+    size = np.linalg.norm(np.ptp(pair.target.points, axis=0))
+    apart = np.linalg.norm(moved - pair.target.points[pairs.target_indices], axis=1)
+    assert np.median(apart) < 0.1 * size
+
+
+def test_the_library_shows_its_names():
+    import utopic_cli
+
+    assert dir(utopic_cli) == sorted(utopic_cli.__all__)
+    assert all(getattr(utopic_cli, name) is not None for name in utopic_cli.__all__)
+    assert issubclass(utopic_cli.InputError, utopic_cli.UtopicError)

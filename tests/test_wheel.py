@@ -61,16 +61,18 @@ def installed(wheel, tmp_path_factory):
     return scripts
 
 
-def test_the_wheel_holds_weights_card_and_type_marker_and_no_tests(wheel):
+def files_in(folder, name):
+    """The files of a folder of the checkout, under another name of it."""
+    paths = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    return {f"{name}/{path.relative_to(folder).as_posix()}" for path in paths}
+
+
+def test_the_wheel_holds_the_package_with_its_pages_and_weights_and_no_tests(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {
-        "utopic_cli/py.typed",
-        "utopic_cli/_weights/utopic.safetensors",
-        "utopic_cli/_weights/utopic.json",
-        "utopic_cli/page/align.html",
-        "utopic_cli/page/page.css",
-        "utopic_cli/page/viewer.js",
-    } <= names
+    package = {name for name in names if name.startswith("utopic_cli/")}
+    expected = files_in(ROOT / "utopic_cli", "utopic_cli") | files_in(ROOT / "weights", "utopic_cli/_weights")
+    assert package == expected
+    assert {Path(name).suffix for name in package} >= {".py", ".typed", ".safetensors", ".html", ".toml"}
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "weights/"))]
 

@@ -16,11 +16,14 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from utopic_cli.errors import InputError as InputError
+    from utopic_cli.errors import UsageError as UsageError
+    from utopic_cli.errors import UtopicError as UtopicError
     from utopic_cli.pipeline import align as align
     from utopic_cli.result import RegistrationResult as RegistrationResult
 
 __version__ = "0.1.0"
-__all__ = ["RegistrationResult", "__version__", "align"]
+__all__ = ["InputError", "RegistrationResult", "UsageError", "UtopicError", "__version__", "align"]
 
 # Steps and warnings go to the logger "utopic_cli", silent until a program asks for it.
 logging.getLogger(__name__).addHandler(logging.NullHandler())
@@ -36,4 +39,12 @@ def __getattr__(name: str) -> Any:
         from utopic_cli.result import RegistrationResult
 
         return RegistrationResult
+    if name in ("InputError", "UsageError", "UtopicError"):
+        from utopic_cli import errors
+
+        return getattr(errors, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

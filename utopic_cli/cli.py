@@ -25,12 +25,13 @@ from utopic_cli.commands.bench_speed import speed
 from utopic_cli.commands.bench_synthetic import mount as mount_synthetic
 from utopic_cli.commands.bench_variants import mount as mount_variants
 from utopic_cli.commands.calibrate import calibrate
-from utopic_cli.commands.console import debug_wanted
+from utopic_cli.commands.console import PlainUsage, debug_wanted
 from utopic_cli.commands.demo import demo
 from utopic_cli.commands.info import info
 from utopic_cli.commands.train import train
 from utopic_cli.commands.transformation import transformation
 from utopic_cli.errors import UtopicError
+from utopic_cli.io.files import printable
 
 # The base class of usage errors has moved between Typer's versions (click, then a copy of it),
 # so it is taken from a class that is exported by all of them.
@@ -58,7 +59,8 @@ class Door(TyperGroup):
             if type(error).__name__ == "NoArgsIsHelpError":  # "utopic bench" alone asks for help
                 raise
             command = error.ctx.command_path if error.ctx else "utopic"
-            _leave(ctx, f"error: {_one_line(error.format_message()).rstrip('.')}; see '{command} --help'", 2)
+            what = _one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
+            _leave(ctx, f"error: {what}; see '{command} --help'", 2)
         except KeyboardInterrupt:
             _leave(ctx, "interrupted", 130)
         except BrokenPipeError:
@@ -71,7 +73,7 @@ class Door(TyperGroup):
 
 
 def _one_line(error: BaseException | str) -> str:
-    return " ".join(str(error).splitlines())
+    return " ".join(printable(str(error)).splitlines())
 
 
 def _leave(ctx: Any, message: str, exit_code: int) -> None:
@@ -132,6 +134,8 @@ mount_variants(bench)
 bench.command()(speed)
 group(bench)
 app.add_typer(bench, name="bench", rich_help_panel=_OWN)
+for one in (*app.registered_commands, *bench.registered_commands):
+    one.cls = PlainUsage
 
 
 def main() -> None:

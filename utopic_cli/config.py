@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 from utopic_cli.errors import InputError
 
@@ -121,6 +121,18 @@ class AlignOptions:
     seed: int = 0
 
 
+class OptionValues(TypedDict, total=False):
+    """``AlignOptions`` as keywords."""
+
+    weights: str
+    points: int
+    refine: bool
+    solver: str
+    device: str
+    threads: int
+    seed: int
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a configuration dataclass as plain JSON-ready data."""
     return {key: _listed(value) for key, value in asdict(config).items()}
@@ -135,7 +147,8 @@ def from_dict(kind: type[ConfigType], values: dict[str, Any], where: str) -> Con
         where: what to call the place the values come from in an error.
 
     Raises:
-        InputError: a key is unknown (the known ones are listed) or a value has another type.
+        InputError: a key is unknown (the known ones are listed), a value has another type, or the
+            dataclass refuses it.
     """
     known = {f.name: f for f in fields(kind)}  # type: ignore[arg-type]
     unknown = sorted(set(values) - set(known))
@@ -154,7 +167,10 @@ def from_dict(kind: type[ConfigType], values: dict[str, Any], where: str) -> Con
                 f"{where}: {key} is {value!r}; expected {type(default).__name__}, like {default!r}"
             )
         built[key] = value
-    return kind(**built)
+    try:
+        return kind(**built)
+    except InputError as error:  # values that don't go together
+        raise InputError(f"{where}: {error}") from error
 
 
 def _listed(value: Any) -> Any:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
+from numbers import Integral
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from utopic_cli.bridge import Eye, NetworkView, cpu_threads, load_network
 from utopic_cli.clock import Clock, Progress
-from utopic_cli.config import SOLVERS, AlignOptions
+from utopic_cli.config import SOLVERS, AlignOptions, OptionValues
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.evidence import SAME, Seen, collect_evidence
 from utopic_cli.estimation.observability import observe
@@ -21,13 +22,16 @@ from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
 from utopic_cli.estimation.verification import measure_fit
 from utopic_cli.frame import find_frame, size_ratio
 from utopic_cli.geometry import rigid
-from utopic_cli.io.records import FormatError
-from utopic_cli.io.scan import check_points, read_scan
+from utopic_cli.given import as_given, take
 from utopic_cli.look import look, look_both_sides
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, carry_to_all, sample_pair
 from utopic_cli.result import Correspondences, Observability, RegistrationResult
 from utopic_cli.verdict import judge, read_calibration
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from typing_extensions import Unpack
 
 FEWEST_NODES = 50
 """The network sees at least this many points of a scan that has them."""
@@ -40,11 +44,11 @@ COUNTERPART_REACH = 3.0
 
 
 def align(
-    source: str | PathLike[str] | np.ndarray,
-    target: str | PathLike[str] | np.ndarray,
+    source: str | PathLike[str] | ArrayLike,
+    target: str | PathLike[str] | ArrayLike,
     *,
-    initial: np.ndarray | None = None,
-    **options: Any,
+    initial: ArrayLike | None = None,
+    **options: Unpack[OptionValues],
 ) -> RegistrationResult:
     """Align two scans: ``p_target = T_target_source @ p_source``.
 
@@ -55,17 +59,28 @@ def align(
         **options: fields of ``AlignOptions``: weights, points, refine, solver, device,
             threads, seed.
 
+    Returns:
+        The answer; its arrays have one value for each point of the file or row of the array, NaN
+        where that is not finite.
+
     Raises:
         InputError: a scan can't be used.
-        UsageError: an unknown option.
+        UsageError: an unknown option, or a value that makes no sense.
     """
-    try:
-        settings = AlignOptions(**options)
-    except TypeError as error:
-        known = ", ".join(AlignOptions.__dataclass_fields__)
-        raise UsageError(f"{error}; known options: {known}") from error
-    clouds = [_as_cloud(scan, name, settings.seed) for scan, name in ((source, "source"), (target, "target"))]
-    return register(clouds[0], clouds[1], settings, initial=initial)
+    known = [option.name for option in fields(AlignOptions)]
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        raise UsageError(f"unknown option {', '.join(unknown)}; known options: {', '.join(known)}, initial")
+    settings = AlignOptions(**options)
+    start = None if initial is None else _as_motion(initial)
+    _check_options(settings, start)
+    # NumPy's whole numbers are as good as Python's, but neither torch nor JSON takes them.
+    settings = replace(
+        settings, points=int(settings.points), threads=int(settings.threads), seed=int(settings.seed)
+    )
+    given = take(source, "source", settings.seed), take(target, "target", settings.seed)
+    result = register(given[0].cloud, given[1].cloud, settings, initial=start)
+    return as_given(result, *given)
 
 
 def register(
@@ -217,28 +232,21 @@ def _check_options(options: AlignOptions, initial: np.ndarray | None) -> None:
         raise UsageError(f"{options.solver}: no such solver; choose {', '.join(SOLVERS)}")
     for name, least in (("points", FEWEST_NODES), ("seed", 0), ("threads", 0)):
         value = getattr(options, name)
-        if not isinstance(value, int) or value < least:
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
             raise UsageError(f"{name} is {value!r}; give a whole number of at least {least}")
-    if initial is not None and (np.shape(initial) != (4, 4) or not rigid.is_rigid(initial, 1e-6)):
+    if not isinstance(options.refine, (bool, np.bool_)):
+        raise UsageError(f"refine is {options.refine!r}; give True or False")
+    if initial is not None and not (initial.shape == (4, 4) and rigid.is_rigid(initial, 1e-6)):
         raise InputError("the initial transformation is no (4, 4) rigid motion")
 
 
-def _as_cloud(scan: str | PathLike[str] | np.ndarray, name: str, seed: int) -> PointCloud:
-    """Read a file, or check an array (N, 3) as a file's points are; NaN points are dropped."""
-    if isinstance(scan, (str, PathLike)):
-        return read_scan(scan, seed=seed).cloud
+def _as_motion(initial: ArrayLike) -> np.ndarray:
     try:
-        points = np.asarray(scan, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: neither a path nor an array of numbers ({error})") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{name}: an array of shape {points.shape}; expected (N, 3)")
-    finite = points[np.isfinite(points).all(axis=1)]
-    try:
-        check_points(finite, len(points))
-    except FormatError as error:
-        raise InputError(f"{name}: {error}") from error
-    return PointCloud(finite)
+        return np.asarray(initial, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"the initial transformation is a {type(initial).__name__}; give a (4, 4) array of numbers"
+        ) from None
 
 
 def _observe(

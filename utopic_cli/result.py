@@ -99,8 +99,8 @@ class RegistrationResult:
         trusted: whether to rely on it; never where there is no calibrated confidence.
         reasons: why (or why not), in plain words.
         ambiguous_with: rival (4, 4) transformations that fit nearly as well.
-        source_overlap: (N,) float32 in [0, 1], one per source point. Of a file or array with
-            NaN points these are the finite ones, in order.
+        source_overlap: (N,) float32 in [0, 1], one per source point; from ``align``, NaN for points
+            of the file or array that are not finite.
         target_overlap: (M,) float32 in [0, 1], one per target point.
         source_uncertainty: (N,) float32 in [0, 1], min-max normalised over the pair.
         target_uncertainty: (M,) float32 in [0, 1], min-max normalised over the pair.

@@ -24,6 +24,13 @@ def test_registers_an_easy_pair_the_same_way_twice(folder: ScanFolder, name: str
     assert first.settings["methods"][name]["voxels_per_extent"] == 50
 
 
+def test_features_are_told_apart_from_unknown_names() -> None:
+    with pytest.raises(UsageError, match=r"'fpfh' is for synthetic pairs only, .*small-gicp"):
+        find_baselines(["fpfh"])
+    with pytest.raises(UsageError, match="unknown baseline 'magic'; known: open3d-ransac"):
+        find_baselines(["magic"])
+
+
 def test_the_settings_are_the_ones_the_tables_name() -> None:
     assert list(BASELINES) == [
         "open3d-ransac",

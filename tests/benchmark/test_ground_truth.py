@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,17 @@ def test_many_pairs_and_one_pair(folder: ScanFolder) -> None:
     (single,) = read_ground_truth(folder.write(folder.pair()))
     np.testing.assert_allclose(single.gt_T_target_source, folder.gt_T_target_source, atol=1e-12)
     assert single.overlap_ratio == {"source": 0.8, "target": 0.7}
+
+
+def test_the_example_in_the_documents_is_read(folder: ScanFolder) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    example = json.loads(text.split("```json\n")[1].split("```")[0])
+    for entry in example["pairs"]:
+        entry.update(source="a.ply", target="b.ply")
+    (pair,) = read_ground_truth(folder.write(example))
+    assert pair.overlap_ratio == {"source": 0.62, "target": 0.55}
+    with pytest.raises(InputError, match=r"docs/benchmarks\.md has an example"):
+        read_ground_truth(folder.path / "nowhere")
 
 
 def test_the_first_overlap_both_sides_have_counts(folder: ScanFolder) -> None:

@@ -158,6 +158,8 @@ def check_report(one: Report, protocol: CropProtocol | RangeProtocol) -> None:
 
     text = printed(one)
     assert "2 pairs of 2 'val' shapes, tiny" in text
+    assert "only 2 pairs: too few to mean much" in text
+    assert ("no lower bound" in text) == (protocol is SHARED)
     assert ("(not the paper's data)" in text) == (protocol is SHARED)
     assert ("UTOPIC (quoted)" in text) == ("statistical floor" in text) == (protocol is SHARED)
 

@@ -300,3 +300,57 @@ def test_points_with_nan_are_dropped_and_said(cli, fake, tmp_path):
     assert result.exit_code == 0, result.stderr
     assert len(fake.calls[0]["source"]) == 70
     assert "warning" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "code", "said"),
+    [
+        ("--html", "p.pdf", 2, "let the name end in .html"),
+        ("--report", "r.html", 2, "let the name end in .json"),
+        ("-o", "moved.ply", 2, "for the moved scan use --aligned"),
+        ("-o", ".", 2, "is a folder; did you mean --out-dir?"),
+        ("--out-dir", "b.ply", 5, "is a file; name a folder"),
+        ("--clouds", "b.ply/c", 5, "can't be made"),
+        ("--colormap", "foo", 2, "'--colormap': 'foo' is not one of"),
+    ],
+)
+def test_a_wrong_name_is_told_before_any_work(cli, fake, scans, monkeypatch, option, name, code, said):
+    monkeypatch.chdir(scans[0].parent)
+    result = cli("align", *scans, option, name)
+    assert result.exit_code == code
+    assert_one_line(result, said)
+    assert not fake.calls
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no file system that takes no files")
+def test_a_folder_that_takes_no_files_is_not_called_missing(cli, fake, scans):
+    for option, name in (("-o", "/proc/x.txt"), ("--clouds", "/proc/x")):
+        result = cli("align", *scans, option, name)
+        assert result.exit_code == 5 and "does not exist" not in result.stderr
+        assert not fake.calls
+
+
+def test_a_missing_file_of_no_known_kind_is_called_missing(cli, fake, scans):
+    result = cli("align", scans[0].with_suffix(".foo"), scans[1])
+    assert result.exit_code == 4
+    assert_one_line(result, "no such file")
+
+
+def test_the_same_bytes_twice_are_a_warning(cli, fake, scans, tmp_path):
+    result = cli("align", scans[0], scans[0], "--report", tmp_path / "r.json")
+    assert result.exit_code == 0 and "both files hold the same bytes" in result.stderr
+    assert "both files hold the same bytes" in (tmp_path / "r.json").read_text()
+    assert "the same bytes" not in cli("align", *scans).stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes")
+def test_a_name_that_is_no_utf8_is_printed_by_its_bytes(cli, fake, scans, tmp_path):
+    odd = scans[0].rename(tmp_path / "caf\udce9.ply")
+    result = cli("align", odd, scans[1], "--html", tmp_path / "p.html")
+    assert result.exit_code == 0 and "caf%E9.ply -> " in result.stderr
+    assert "caf%E9.ply: no such file" in cli("align", tmp_path / "no" / odd.name, odd).stderr
+
+
+def test_the_usage_line_names_arguments_plainly(cli):
+    assert "[OPTIONS] SOURCE TARGET" in cli("align", "--help").stdout
+    assert "[OPTIONS] INPUT... " in cli("batch", "--help").stdout

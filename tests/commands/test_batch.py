@@ -86,9 +86,10 @@ def test_parts_and_nothing_have_exit_codes_of_their_own(cli, stubbed, tmp_path):
         (["scans", "--out-dir", "out", "--cluster", "tcp://x:1", "--workers", "2"], 2, "choose one"),
         (["scans", "--out-dir", "out", "--cluster", "nonsense"], 4, "nonsense: no Dask scheduler answers"),
         (["nowhere", "--out-dir", "out"], 4, "no such file or folder"),
-        (["scans/a.ply", "--out-dir", "out"], 4, "at least two"),
+        (["scans/a.ply", "--out-dir", "out"], 4, "only one scan given; a batch needs at least two"),
         (["scans", "--out-dir", "out", "--pairs", "none.csv"], 4, "none.csv: no such file"),
-        (["scans", "--out-dir", "no/such/out"], 5, "the folder can't be made"),
+        (["scans", "--out-dir", "no/such/out"], 5, "the folder no/such does not exist"),
+        (["scans", "--out-dir", "scans/a.ply"], 5, "is a file; name a folder"),
     ],
 )
 def test_mistakes_are_told_in_one_line_before_any_work(
@@ -129,7 +130,7 @@ def test_bad_inputs_are_named_with_their_exit_codes(cli, stubbed, tmp_path):
         (tmp_path / "more" / name).write_text("nothing")
     junk = [tmp_path / "more" / name for name in ("x.ply", "y.ply")]
     result = cli("batch", *junk, "--out-dir", tmp_path / "none")
-    assert result.exit_code == 4 and "none of 2 scans can be read; the first: " in result.stderr
+    assert result.exit_code == 4 and "none of 2 scans can be read: " in result.stderr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
@@ -256,3 +257,16 @@ def test_three_real_scans_become_one_model(cli, tmp_path, monkeypatch):
         assert relative_rotation_error_deg(found, known) < 2.0
     record = json.loads((out / "pairs" / "view1--view0.json").read_text())
     assert record["report"]["weights"]["name"] == "utopic"
+
+
+def test_a_dry_run_says_what_an_earlier_batch_left(cli, stubbed, tmp_path):
+    write_scans(tmp_path / "scans", ["a.ply", "b.ply"])
+    out = tmp_path / "out"
+    (out / "pairs").mkdir(parents=True)
+    (out / "pairs" / "b--a.json").write_text("{}")
+    asked = ["batch", tmp_path / "scans", "--out-dir", out, "--dry-run"]
+    result = cli(*asked)
+    assert result.exit_code == 0 and "pair  b--a  recorded" in result.stdout
+    assert "1 of its pairs recorded; pass --resume to go on with it or --overwrite" in result.stdout
+    assert "used again" in cli(*asked, "--resume").stdout
+    assert "replaced" in cli(*asked, "--overwrite").stdout

@@ -73,3 +73,11 @@ def test_the_environment_that_matters_is_shown(cli, monkeypatch):
     facts = json.loads(cli("info", "--json").stdout)
     assert facts["environment"]["OMP_NUM_THREADS"] == "1"
     assert "CPUs" in facts["devices"]["cpu"]
+
+
+def test_numbers_are_for_reading():
+    from utopic_cli.commands.info import _counted, _line
+
+    assert (_counted(1, "thread"), _counted(2, "CPU")) == ("1 thread", "2 CPUs")
+    assert _line("wall_clock_s", 12372.8) == "training time: 3.4 h"
+    assert _line("trusted_from", 0.9228266292248096) == "trusted_from: 0.9228"

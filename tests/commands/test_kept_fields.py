@@ -10,6 +10,7 @@ import pytest
 from tests.io.samples import bumpy_points, ply
 from utopic_cli.commands.kept_fields import kept_fields
 from utopic_cli.errors import InputError
+from utopic_cli.io.ply_writer import scalar_cloud_ply
 from utopic_cli.io.scan import read_scan
 
 COUNT = 80
@@ -98,6 +99,29 @@ def test_intensity_and_colours_of_e57(tmp_path: Path) -> None:
     np.testing.assert_array_equal(kept["intensity"], number / 8)
     np.testing.assert_array_equal(kept["original_red"], number)
     np.testing.assert_array_equal(kept["original_blue"], number + 150)
+
+
+def test_a_constant_field_of_e57_and_one_that_cannot_be_read(tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    from tests.io.test_e57 import constant
+    from utopic_cli.io.e57_file import open_e57
+
+    path = constant(tmp_path, bumpy_points(COUNT))
+    np.testing.assert_array_equal(kept_fields(read_scan(path))["intensity"], np.full(COUNT, 7.0))
+    file = open_e57(path.read_bytes())
+    place = file.xml.index(b"<intensity")
+    path.write_bytes(file.with_xml(file.xml[:place] + file.xml[place:].replace(b"Integer", b"Strange", 1)))
+    assert kept_fields(read_scan(path)) == {}
+
+
+def test_names_that_become_one_property_are_told_apart(tmp_path: Path) -> None:
+    columns = {name: ("f4", np.full(COUNT, i)) for i, name in enumerate(("inx", "in_x", "original_in_x"))}
+    kept = kept_fields(read_scan(ply_scan(tmp_path / "a.ply", columns)))
+    assert sorted(values[0] for values in kept.values()) == [0, 1, 2]
+    scalar_cloud_ply(bumpy_points(COUNT), np.zeros((COUNT, 3), np.uint8), kept)
+    with pytest.raises(ValueError, match="inx, in_x two become one"):
+        twice = dict.fromkeys(("inx", "in_x"), np.zeros(COUNT))
+        scalar_cloud_ply(bumpy_points(COUNT), np.zeros((COUNT, 3), np.uint8), twice)
 
 
 def test_colours_packed_into_one_number_of_a_pcd(tmp_path: Path) -> None:

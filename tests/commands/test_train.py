@@ -11,6 +11,7 @@ from utopic_cli.commands.console import Console
 from utopic_cli.commands.training_view import TrainingView, clock, describe
 from utopic_cli.synthesis.shapes import procedural_shapes
 from utopic_cli.training.config import read_training_config
+from utopic_cli.training.pace import InterruptedRun
 
 RECORD = {
     "pairs": 8,
@@ -79,6 +80,20 @@ def test_where_there_is_no_terminal_each_record_is_a_plain_line(cli, trainer, tm
     assert "\x1b" not in result.stderr
 
 
+def test_an_interrupted_run_says_what_it_saved(cli, trainer, tmp_path, monkeypatch):
+    def stop(config, training_shapes, validation_shapes, out, **options):
+        raise InterruptedRun(out / "utopic.safetensors")
+
+    monkeypatch.setattr("utopic_cli.training.trainer.train", stop)
+    out = tmp_path / "run"
+    result = cli("train", "--out", out)
+    assert result.exit_code == 130
+    assert result.stderr.splitlines()[-2:] == [
+        f"saved {out}/checkpoint.pt and exported {out}/utopic.safetensors; go on: the same with --resume",
+        "utopic: interrupted",
+    ]
+
+
 def test_quiet_says_nothing(cli, trainer, tmp_path):
     assert cli("train", "--out", tmp_path / "run", "--quiet").stderr == ""
 
@@ -137,7 +152,9 @@ def test_a_run_that_is_there_is_not_overwritten(cli, trainer, tmp_path, name):
     assert cli("train", "--out", tmp_path, "--resume").exit_code == 0
 
 
-@pytest.mark.parametrize("content", ["[model\n", "[model]\nheads = 'many'\n", "[model]\nhaeds = 4\n"])
+@pytest.mark.parametrize(
+    "content", ["[model\n", "[model]\nheads = 'many'\n", "[model]\nhaeds = 4\n", "[model]\nheads = 3\n"]
+)
 def test_a_configuration_that_cant_be_used_exits_4(cli, trainer, tmp_path, content):
     (tmp_path / "c.toml").write_text(content)
     result = cli("train", "--out", tmp_path / "run", "--config", tmp_path / "c.toml")
@@ -163,6 +180,8 @@ def test_skipped_shapes_are_counted_and_named(cli, trainer, tmp_path, monkeypatc
     assert result.exit_code == 0, result.output
     (line,) = [line for line in result.stderr.splitlines() if "warning" in line]
     assert line.startswith("utopic: warning: skipped 1 shape") and "bad.ply: it has no faces" in line
+    again = cli("train", "--out", tmp_path / "run", "--data", tmp_path, "--resume").stderr
+    assert "warning" not in again and "skipped 1 shape" in again.splitlines()
 
 
 @pytest.mark.parametrize("place", ["file", "file/run", "file/deeper/run"])
@@ -179,12 +198,22 @@ def test_a_record_is_one_line():
     assert describe(record) == "1/2 pairs, descriptor, 0:06, pairs/s 3.21"
 
 
+def test_a_budget_that_ends_the_run_is_told_as_such():
+    budget = {**RECORD, "of": 14500, "left_s": 12.0}
+    assert "1:30, stops in 0:12, " in describe(budget)
+
+
+def test_settings_that_ship_are_named_in_the_help(cli):
+    text = " ".join(cli("train", "--help").stdout.replace("│", " ").split())
+    assert "Settings: default, paper, variants, or a file" in text
+
+
 def test_durations():
     assert [clock(seconds) for seconds in (-3, 59.6, 3599, 3600)] == ["0:00", "1:00", "59:59", "1:00:00"]
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "arrow"), [(0.25, 0.5, " ▲25.0"), (0.5, 0.25, " ▼25.0"), (0.5, 0.50001, " =")]
+    ("before", "after", "arrow"), [(0.25, 0.5, " ▲25.0"), (0.5, 0.25, " ▼25.0"), (0.5, 0.50001, " unchanged")]
 )
 def test_the_change_of_a_validation_is_told(before, after, arrow):
     line = describe({**RECORD, "hit_rate": after}, {"hit_rate": before})

@@ -125,6 +125,40 @@ def test_packed_integers_of_any_width(tmp_path: Path, least: int, most: int) -> 
     np.testing.assert_array_equal(read_e57(path.read_bytes()).points, values)
 
 
+@pytest.mark.parametrize("least", [-(2**62) - 1, -(2**63)])
+def test_packed_integers_whose_limits_no_double_holds(tmp_path: Path, least: int) -> None:
+    """Small numbers of a wide column are exact, wherever its limits lie."""
+    values = np.random.default_rng(6).integers(-(2**40), 2**40, (300, 3))
+    node = lambda image: libe57.IntegerNode(image, 0, least, -least - 1)  # noqa: E731
+    columns = {f"cartesian{axis}": (node, values[:, i]) for i, axis in enumerate("XYZ")}
+    path = write_columns(tmp_path / "a.e57", columns, tuple(columns))
+    np.testing.assert_array_equal(read_e57(path.read_bytes()).points, values)
+
+
+def constant(tmp_path: Path, points: np.ndarray) -> Path:
+    """Points of an E57 file whose only further field takes no bits."""
+    double = lambda image: libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, -1e3, 1e3)  # noqa: E731
+    columns = {f"cartesian{axis}": (double, points[:, i]) for i, axis in enumerate("XYZ")}
+    columns["intensity"] = (lambda image: libe57.IntegerNode(image, 7, 7, 7), np.full(len(points), 7.0))
+    return write_columns(tmp_path / "a.e57", columns, tuple(columns))
+
+
+def test_a_field_that_is_constant_is_told(tmp_path: Path) -> None:
+    records = read_e57(constant(tmp_path, bumpy_points()).read_bytes())
+    np.testing.assert_array_equal(records.document.fields(80)["intensity"], np.full(80, 7.0))
+    with pytest.raises(FormatError, match="promises 80 E57 points but holds 79"):
+        records.document.fields(79)
+
+
+def test_coordinates_that_are_constant_are_refused_whatever_the_promised_number(tmp_path: Path) -> None:
+    node = lambda image: libe57.IntegerNode(image, 3, 3, 3)  # noqa: E731
+    columns = {f"cartesian{axis}": (node, np.full(80, 3.0)) for axis in "XYZ"}
+    columns["cartesianInvalidState"] = (lambda image: libe57.IntegerNode(image, 0, 0, 2), np.zeros(80))
+    path = write_columns(tmp_path / "a.e57", columns, tuple(columns))
+    with pytest.raises(FormatError, match="all equal"):
+        read_e57(path.read_bytes())
+
+
 def test_spherical_coordinates(tmp_path: Path) -> None:
     points = bumpy_points() + [3, 0, 0]
     distance = np.linalg.norm(points, axis=1)

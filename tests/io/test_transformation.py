@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.io.samples import motion, mutated
 from utopic_cli.errors import InputError, OutputError
@@ -281,3 +282,20 @@ def test_mutated_files_are_read_or_refused(tmp_path: Path) -> None:
                 assert str(error).isprintable()
             else:
                 np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_what_is_rigid_comes_back_to_the_byte(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
+        matrix[:3, 3] = rng.normal(0, 1e3, 3)
+        data = format_transformation(matrix, "matrix")
+        (tmp_path / "T.txt").write_bytes(data)
+        assert format_transformation(read_transformation(tmp_path / "T.txt"), "matrix") == data
+
+
+def test_a_table_of_poses_points_to_the_poses_file(tmp_path: Path) -> None:
+    (tmp_path / "poses.csv").write_text("name,group\n")
+    with pytest.raises(InputError, match=r"poses\.json#NAME"):
+        read_transformation(tmp_path / "poses.csv")

@@ -124,7 +124,7 @@ def test_no_scan_that_can_be_read_is_an_input_error(tmp_path):
     (tmp_path / "scans").mkdir()
     for name in ("a.ply", "b.ply"):
         (tmp_path / "scans" / name).write_text(f"no scan {name}")
-    with pytest.raises(InputError, match=r"none of 2 scans can be read; the first: .*a\.ply"):
+    with pytest.raises(InputError, match=r"none of 2 scans can be read: .*a\.ply"):
         run(tmp_path)
 
 

@@ -38,7 +38,7 @@ def test_every_point_of_every_scan_is_there_with_its_colour(tmp_path):
     count = write_merged(tmp_path / "m.ply", group, files, seed=0)
     table = read(tmp_path / "m.ply")
     assert count == len(table) == 400
-    assert (table["scan"] == np.repeat([0.0, 1.0], 200)).all()
+    assert (table["scalar_scan"] == np.repeat([0.0, 1.0], 200)).all()
     for number, rows in ((0, slice(0, 200)), (1, slice(200, 400))):
         points = apply(group[number], read_scan(files[number].path).cloud.points)
         assert (np.stack([table[name][rows] for name in "xyz"], axis=1) == points).all()
@@ -56,7 +56,7 @@ def test_cells_keep_one_point_each_across_scans(tmp_path):
     everything = apply(group[0], read_scan(files[0].path).cloud.points)
     cells = np.floor((points - everything.mean(axis=0)) / 0.7)
     assert len(np.unique(cells, axis=0)) == len(cells)
-    assert {tuple(p) for p in points[table["scan"] == 0]} <= {tuple(p) for p in everything}
+    assert {tuple(p) for p in points[table["scalar_scan"] == 0]} <= {tuple(p) for p in everything}
 
 
 def test_cells_without_number_are_refused_and_nothing_is_left(tmp_path):
@@ -166,10 +166,13 @@ def test_fields_that_most_scans_have_are_kept(tmp_path):
     )
     text = "x y z intensity gps_time\n" + "\n".join(rows_with(np.column_stack([-numbers, numbers])))
     table = merged(tmp_path / "s", ply=ply, pcd=packed_pcd("binary"), xyz=text)
-    assert table.dtype.names == ("x", "y", "z", "red", "green", "blue", "scan", "intensity", "gps_time")
-    assert (table["intensity"] == [*numbers, *numbers, *-numbers]).all()  # in all of them
-    assert (table["gps_time"][:60] == 1e9 + numbers / 7).all()  # as exact as it was
-    assert np.isnan(table["gps_time"][60:120]).all() and (table["gps_time"][120:] == numbers).all()
+    # As viewers look for them; MeshLab would paint the points by a property called intensity.
+    own = ("x", "y", "z", "red", "green", "blue", "scalar_scan")
+    assert table.dtype.names == (*own, "scalar_intensity", "scalar_gps_time")
+    assert (table["scalar_intensity"] == [*numbers, *numbers, *-numbers]).all()  # in all of them
+    assert (table["scalar_gps_time"][:60] == 1e9 + numbers / 7).all()  # as exact as it was
+    assert np.isnan(table["scalar_gps_time"][60:120]).all()
+    assert (table["scalar_gps_time"][120:] == numbers).all()
     assert (colours_in(table)[60:120] == RGB).all()
 
 
@@ -179,10 +182,10 @@ def test_a_field_that_is_not_all_numbers_is_left_blank_and_our_own_names_stay_ou
     late = [row.replace(" ", ",") for row in rows * 10]
     late[-1] = late[-1].rsplit(",", 2)[0] + ",none,1"
     table = merged(tmp_path / "s", csv=header + "\n".join(late), csv_=header + "\n".join(late[:60]))
-    assert table.dtype.names[6:] == ("scan", "scan_", "of_row")
-    assert (table["scan"] == np.repeat([0, 1], [600, 60])).all()
-    assert (table["scan_"][:60] == np.arange(60)).all()
-    assert np.isnan(table["of_row"][:600]).all() and (table["of_row"][600:] == 1).all()
+    assert table.dtype.names[6:] == ("scalar_scan", "scalar_scan_", "scalar_of_row")
+    assert (table["scalar_scan"] == np.repeat([0, 1], [600, 60])).all()
+    assert (table["scalar_scan_"][:60] == np.arange(60)).all()
+    assert np.isnan(table["scalar_of_row"][:600]).all() and (table["scalar_of_row"][600:] == 1).all()
 
 
 def test_values_stay_with_their_points_where_some_are_not_finite(tmp_path):
@@ -192,4 +195,30 @@ def test_values_stay_with_their_points_where_some_are_not_finite(tmp_path):
     ply = ascii_ply(properties, rows)
     table = merged(tmp_path / "s", ply=ply, ply_=ply + "\n")
     expected = [i for i in range(60) if i not in (0, 30)] * 2
-    assert table["red"].tolist() == expected == table["intensity"].tolist()
+    assert table["red"].tolist() == expected == table["scalar_intensity"].tolist()
+
+
+def test_colours_and_intensities_of_e57(tmp_path):
+    pye57 = pytest.importorskip("pye57")
+    told = {"intensity": np.arange(60) / 8, **dict(zip(("colorRed", "colorGreen", "colorBlue"), RGB.T * 1.0))}
+    (tmp_path / "e57").mkdir()
+    for name, told_here in (("a", told), ("b", told), ("c", {})):
+        file = pye57.E57(str(tmp_path / "e57" / f"{name}.e57"), mode="w")
+        for half in (slice(0, 30), slice(30, 60)):  # two scans in a file
+            points = POINTS[half] + ord(name)
+            columns = {f"cartesian{axis}": points[:, i].copy() for i, axis in enumerate("XYZ")}
+            file.write_scan_raw(columns | {name: values[half].copy() for name, values in told_here.items()})
+        file.close()
+    files = dict(enumerate(find_scans([tmp_path / "e57"]).scans))
+    write_merged(tmp_path / "m.ply", dict.fromkeys(files, np.eye(4)), files, seed=0)
+    table = read(tmp_path / "m.ply")
+    assert (colours_in(table) == [*RGB, *RGB, *np.full((60, 3), 190)]).all()
+    np.testing.assert_array_equal(table["scalar_intensity"][:120], np.tile(np.arange(60) / 8, 2))
+    assert np.isnan(table["scalar_intensity"][120:]).all()
+
+
+def test_names_that_become_one_property_are_told_apart(tmp_path):
+    text = "x y z inx in_x\n" + "\n".join(rows_with(np.column_stack([np.arange(60), -np.arange(60)])))
+    table = merged(tmp_path / "s", xyz=text, xyz_=text + "\n")
+    assert table.dtype.names[7:] == ("scalar_in_x", "scalar_in_x_")
+    assert (table["scalar_in_x"] + table["scalar_in_x_"] == 0).all()

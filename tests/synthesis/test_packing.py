@@ -144,6 +144,20 @@ def test_bad_shapes_are_skipped_and_named(tmp_path):
     assert line.startswith("skipped 8 shapes: broken.ply: ") and line.endswith("and 5 more")
 
 
+def test_a_readme_is_no_broken_shape(tmp_path):
+    many(tmp_path, 3)
+    (tmp_path / "readme.txt").write_text("These are my scans.\nMade in 2021, on 3 days.\n")
+    (tmp_path / "list.csv").write_text("name,size\na,1\n")
+    library = open_shapes(str(tmp_path))
+    assert {name for name, _ in library.skipped} == {"list.csv", "readme.txt"}
+    assert describe_skipped(library) is None
+    (tmp_path / "cut.txt").write_text("x y z\n-0.5, .25, 1e-3\n1 2\n")  # meant to be a cloud
+    (tmp_path / "empty.txt").write_text("")
+    line = describe_skipped(open_shapes(str(tmp_path)))
+    assert line is not None and line.startswith("skipped 2 shapes: cut.txt: ") and "empty.txt" in line
+    assert line.endswith("; text files left out: 2")
+
+
 def test_folders_without_shapes_are_input_errors(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"no shapes here.*\.ply.*procedural"):

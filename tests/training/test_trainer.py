@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import multiprocessing
 import os
 import signal
 
@@ -30,11 +31,13 @@ from utopic_cli.training.data import (
     Batch,
     BatchOrder,
     SynthesisedPairs,
+    batch_loader,
     sample_pair,
     to_training_pair,
 )
 from utopic_cli.training.network import TrainingNetwork, total_loss
 from utopic_cli.training.optimisation import learning_rate
+from utopic_cli.training.pace import InterruptedRun
 
 SCHEDULE = Schedule(
     descriptor_pairs=4,
@@ -91,13 +94,26 @@ def test_a_signal_saves_the_step_in_hand(shapes, tmp_path, number):
 
     before = signal.getsignal(number)
     if number == signal.SIGINT:
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(InterruptedRun) as stop:
             run(shapes, tmp_path, progress=interrupt)
+        assert stop.value.weights == tmp_path / "utopic.safetensors"
     else:
         run(shapes, tmp_path, progress=interrupt)
     assert signal.getsignal(number) == before
     assert read_checkpoint(tmp_path / "checkpoint.pt")["pairs"] == SCHEDULE.batch
     assert (tmp_path / "utopic.safetensors").is_file()
+
+
+def test_workers_outlive_signals_to_the_whole_group(shapes):
+    pairs = SynthesisedPairs(shapes, PairSettings(), 1, 6)
+    batches = iter(batch_loader(pairs, BatchOrder(0, 40, 1, 1, lambda _: (60, 60)), workers=1))
+    next(batches)
+    (worker,) = multiprocessing.active_children()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        os.kill(worker.pid, number)
+    assert sum(1 for _ in batches) == 39
+    worker.join(20)
+    assert worker.exitcode == 0  # told to end, it does
 
 
 def test_the_journal_starts_with_the_untrained_network(shapes, tmp_path):

@@ -135,7 +135,7 @@ class _Desk:
         )
 
     def floor(self, shared: np.ndarray) -> Answer:
-        """The best anybody can do who knows the correspondences, but not the noise."""
+        """Procrustes on the true correspondences: its error is what the noise alone leaves."""
         source, target = self._pair.source.points[shared[:, 0]], self._pair.target.points[shared[:, 1]]
         try:
             T = weighted_procrustes(source, target, np.ones(len(shared)))

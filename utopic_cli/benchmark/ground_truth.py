@@ -35,6 +35,7 @@ from utopic_cli.geometry.rigid import apply, invert, is_rigid, nearest_rotation,
 from utopic_cli.point_cloud import PointCloud
 
 RIGID_TOLERANCE = 1e-4
+EXAMPLE = "docs/benchmarks.md has an example of gt.json"
 COUNTERPART_SHARE_OF_EXTENT = 0.01
 
 
@@ -69,18 +70,17 @@ def read_ground_truth(directory: Path) -> tuple[KnownPair, ...]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(
-            f"{path}: can't be read ({error.strerror}); a folder of scans needs one, "
-            "see utopic_cli/benchmark/ground_truth.py for its layout"
+            f"{path}: can't be read ({error.strerror}); a folder of scans needs one, {EXAMPLE}"
         ) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid JSON ({error})") from error
     if not isinstance(content, dict):
-        raise InputError(f"{path}: the top level must be an object with 'pairs', or one pair")
+        raise InputError(f"{path}: the top level must be an object with 'pairs', or one pair; {EXAMPLE}")
     if "pairs" not in content:
         return (_pair(content, 0, directory, f"{path}: the pair"),)
     entries = content["pairs"]
     if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: 'pairs' must be a list with at least one pair")
+        raise InputError(f"{path}: 'pairs' must be a list with at least one pair; {EXAMPLE}")
     return tuple(
         _pair(entry, index, directory, f"{path}: pairs[{index}]") for index, entry in enumerate(entries)
     )
@@ -103,7 +103,7 @@ def measured_overlap(
 
 def _pair(entry: Any, index: int, directory: Path, where: str) -> KnownPair:
     if not isinstance(entry, dict):
-        raise InputError(f"{where} must be an object with source, target and T_target_source")
+        raise InputError(f"{where} must be an object with source, target and T_target_source; {EXAMPLE}")
     source, target = (_scan_file(entry, side, directory, where) for side in ("source", "target"))
     name = f"{where} ({source.name} -> {target.name})"
     return KnownPair(index, source, target, _rigid_matrix(entry, name), _overlap_ratio(entry, name))
@@ -112,7 +112,7 @@ def _pair(entry: Any, index: int, directory: Path, where: str) -> KnownPair:
 def _scan_file(entry: dict[str, Any], side: str, directory: Path, where: str) -> Path:
     name = entry.get(side)
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where} does not name its {side} file")
+        raise InputError(f"{where} does not name its {side} file; {EXAMPLE}")
     path = directory / name
     if not path.is_file():
         raise InputError(f"{where}: its {side} {name!r} is not a file in {directory}")
@@ -125,7 +125,7 @@ def _rigid_matrix(entry: dict[str, Any], where: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4):
-        raise InputError(f"{where}: T_target_source must be 4 rows of 4 numbers")
+        raise InputError(f"{where}: T_target_source must be 4 rows of 4 numbers; {EXAMPLE}")
     if not is_rigid(matrix, RIGID_TOLERANCE):
         raise InputError(
             f"{where}: T_target_source is no rigid transformation; its rotation must be orthonormal to "

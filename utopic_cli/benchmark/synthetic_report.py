@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SCHEMA_VERSION = 1
+FEWEST = 10
+"""Pairs, or shapes, below which the table says that they are too few."""
 
 
 @dataclass(frozen=True)
@@ -156,11 +158,13 @@ def render(report: Report, console: Console) -> None:
 
 def _poses(report: Report) -> Table:
     protocol = report.settings["protocol"]
+    floor = "; x floor: over the error of Procrustes on the true correspondences, no lower bound"
     table = make_table(
         report.title,
+        f"{_too_few(report.settings)}"
         f"recall: both errors are less; lengths in: {protocol['length_unit']}; translations compared "
         f"{protocol['translation_error']}; or symmetric: or the object lies within 2 % of its extent of its "
-        "place; [95 % Wilson interval]",
+        f"place; [95 % Wilson interval]{floor if any(one.stage == FLOOR for one in report.answers) else ''}",
         (
             "Error(R)\nmean, deg",
             "\nmedian",
@@ -194,6 +198,15 @@ def _poses(report: Report) -> Table:
         )
         previous = group
     return table
+
+
+def _too_few(settings: dict[str, Any]) -> str:
+    """Warn of figures that say little."""
+    for what in ("pairs", "shapes"):
+        if settings[what] < FEWEST:
+            one = what[:-1] if settings[what] == 1 else what
+            return f"only {settings[what]} {one}: too few to mean much; "
+    return ""
 
 
 def _paper(report: Report) -> Table:

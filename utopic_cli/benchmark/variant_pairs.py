@@ -178,7 +178,7 @@ def _pose_from(values: Mapping[str, Any]) -> PoseMeasures:
 
 
 def _floor(pair: ScanPair, shared: np.ndarray, protocol: AnyProtocol) -> PoseMeasures | None:
-    """The best anybody can do who knows the correspondences, but not the noise."""
+    """Procrustes on the true correspondences: its error is what the noise alone leaves."""
     source, target = pair.source.points[shared[:, 0]], pair.target.points[shared[:, 1]]
     try:
         return _pose(weighted_procrustes(source, target, np.ones(len(shared))), pair, protocol)

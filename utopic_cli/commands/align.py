@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -245,6 +245,9 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
             progress(f"reading {request.target.name}")
             target = read_scan(request.target, seed=request.options.seed)
             initial = read_transformation(request.init) if request.init else None
+        if source.sha256 == target.sha256:
+            same = f"{source.path} and {target.path}: both files hold the same bytes; check their names"
+            target = replace(target, warnings=(*target.warnings, same))
         result = pipeline.register(
             source.cloud, target.cloud, request.options, initial=initial, progress=progress
         )

@@ -22,6 +22,7 @@ from utopic_cli.commands.console import (
 )
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
+from utopic_cli.io.files import printable
 
 if TYPE_CHECKING:
     from utopic_cli.multiway.outcome import BatchOutcome
@@ -172,10 +173,15 @@ def _cpus() -> int:
 
 def _say_plan(plan: BatchPlan, request: BatchRequest) -> None:
     """Say on stdout what would be done."""
+    from utopic_cli.multiway.outcome import pair_name
+
     scans = plan.scans.scans
+    recorded = {path.stem for path in plan.earlier if path.parent.name == "pairs"}
+    if plan.earlier:
+        _say_earlier(request, len(recorded))
     for scan in scans:
         fate = scan.problem or (f"copy of {scan.copy_of}" if scan.copy_of else "to align")
-        typer.echo(_printable(f"scan  {scan.name}  {scan.path}  {fate}"))
+        typer.echo(printable(f"scan  {scan.name}  {scan.path}  {fate}"))
     if plan.first is None:
         typer.echo(
             f"pairs  chosen by what the network sees of each of {len(plan.usable)} scans; "
@@ -183,13 +189,28 @@ def _say_plan(plan: BatchPlan, request: BatchRequest) -> None:
         )
         return
     for source, target in plan.first:
-        typer.echo(_printable(f"pair  {scans[source].name}--{scans[target].name}"))
+        name = pair_name(scans[source], scans[target])
+        typer.echo(printable(f"pair  {name}{'  recorded' if name in recorded else ''}"))
     where = f"{request.workers} at a time" if request.cluster is None else f"on {request.cluster}"
     typer.echo(f"{len(plan.first)} pairs of {len(plan.usable)} scans, {where}")
 
 
+def _say_earlier(request: BatchRequest, recorded: int) -> None:
+    """Say what becomes of the batch that is in the folder already."""
+    held = f"{request.out_dir}: holds an earlier batch, {recorded} of its pairs recorded"
+    if request.resume:
+        fate = "they are used again where neither scans nor options have changed"
+    elif request.overwrite:
+        fate = "it would be replaced"
+    else:
+        fate = "pass --resume to go on with it or --overwrite to begin anew"
+    typer.echo(printable(f"{held}; {fate}"))
+
+
 def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console) -> None:
-    console.warnings(tuple(_printable(note) for note in outcome.notes))
+    from utopic_cli.multiway.folder import results
+
+    console.warnings(outcome.notes)
     placed = sum(entry.group is not None for entry in outcome.scans)
     wanted = sum(entry.passed_over is None for entry in outcome.scans)
     groups = outcome.model.groups
@@ -197,12 +218,12 @@ def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console)
     console.line(f"{placed} of {wanted} scans placed" + (f", in {said}" if groups else ""))
     for number, group in enumerate(groups, 1):
         names = ", ".join(outcome.scans[scan].file.name for scan in group.T_world_scan)
-        console.line(_printable(f"  {f'group {number}':<9}{len(group.T_world_scan)} scans: {names}"))
+        console.line(f"  {f'group {number}':<9}{len(group.T_world_scan)} scans: {names}")
     for entry in outcome.scans:
         if entry.left_out is not None:
-            console.line(_printable(f"  {'left out':<9}{entry.file.name}: {entry.left_out}"))
+            console.line(f"  {'left out':<9}{entry.file.name}: {entry.left_out}")
         elif entry.passed_over is not None:
-            console.line(_printable(f"  {'no scan':<9}{entry.passed_over}"))
+            console.line(f"  {'no scan':<9}{entry.passed_over}")
     verdicts: dict[str, int] = {}
     for pair in outcome.model.pairs:
         verdicts[pair.verdict] = verdicts.get(pair.verdict, 0) + 1
@@ -213,7 +234,7 @@ def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console)
     for pair in outcome.model.pairs:
         reason = f": {pair.reason}" if pair.reason else ""
         name = outcome.pair_name(pair.source, pair.target)
-        line = _printable(f"  {'pair':<9}{name} {pair.verdict}{reason}")
+        line = f"  {'pair':<9}{name} {pair.verdict}{reason}"
         failed += pair.verdict == "failed"
         if pair.verdict == "failed" and failed <= MOST_FAILURES_SAID:
             console.line(line)
@@ -222,9 +243,4 @@ def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console)
     if failed > MOST_FAILURES_SAID:
         console.line(f"  {'':<9}{failed - MOST_FAILURES_SAID} more pairs failed: see summary.csv")
     console.line(f"  {'time':<9}{outcome.seconds:.0f} s")
-    console.line(f"  {'wrote':<9}{request.out_dir / 'poses.json'} and what is beside it")
-
-
-def _printable(text: str) -> str:
-    """Return text that any terminal takes, whatever of a file's name it quotes."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+    console.files([*results(request.out_dir), request.out_dir / "pairs" / "*.json"])

@@ -52,7 +52,12 @@ def protocols() -> None:
 
 @bench.command()
 def scans(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Scans with their known answers in gt.json.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR", help="Scans with their known answers in gt.json (example: docs/benchmarks.md)."
+        ),
+    ],
     pairs: Annotated[
         int | None,
         typer.Option(

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperCommand
 
 from utopic_cli.config import ColourMapName
 from utopic_cli.errors import OutputError
+from utopic_cli.io.files import printable
 
 _DEBUG = "utopic_cli.debug"
 
@@ -27,6 +29,7 @@ LABEL_WIDTH = 9
 BAR_WIDTH = 16
 SECONDS_BETWEEN_LINES = 10.0  # of progress, where stderr is a file or a pipe
 _COUNT = re.compile(r"(\d+)/(\d+)\b")
+_BRACED = re.compile(r"\{(.+)\}(|\.\.\.)$")
 
 
 def debug_wanted(ctx: Any) -> bool:
@@ -102,6 +105,22 @@ Colormap = Annotated[
 ]
 
 
+class PlainUsage(TyperCommand):
+    """A command whose usage line names its arguments as the help text does, without braces."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the words after the command's name."""
+        return [_BRACED.sub(_unbraced, piece) for piece in super().collect_usage_pieces(ctx)]
+
+
+def _unbraced(found: re.Match[str]) -> str:
+    return found[1] if "..." in found[1] else found[1] + found[2]
+
+
+def _one_line(text: str) -> str:
+    return " ".join(printable(text).splitlines())
+
+
 class Console:
     """Lines and progress on stderr; stdout is left to results.
 
@@ -121,14 +140,14 @@ class Console:
     def line(self, text: str = "") -> None:
         """Write one line, unless quiet."""
         if not self.quiet:
-            self._rich.print(" ".join(text.splitlines()), markup=False, soft_wrap=True)
+            self._rich.print(_one_line(text), markup=False, soft_wrap=True)
 
     def headline(self, about: str, verdict: str, good: bool) -> None:
         """Write what it is about and how it went, which stands out on a terminal."""
         if not self.quiet:
             from rich.text import Text
 
-            text = Text(" ".join(about.splitlines()) + " ")
+            text = Text(_one_line(about) + " ")
             text.append(verdict, style="bold green" if good else "bold yellow")
             self._rich.print(text, soft_wrap=True)
 
@@ -151,7 +170,7 @@ class Console:
         row = Table.grid()
         row.add_column(width=2 + LABEL_WIDTH, no_wrap=True)
         row.add_column(overflow="fold")
-        row.add_row(Text(f"  {label}", style="dim"), Text(" ".join(text.splitlines()), style=style))
+        row.add_row(Text(f"  {label}", style="dim"), Text(_one_line(text), style=style))
         self._rich.print(row)
 
     def files(self, paths: Sequence[Path]) -> None:

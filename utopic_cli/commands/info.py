@@ -67,7 +67,7 @@ def collect() -> dict[str, dict[str, Any]]:
 
     versions = {"utopic-cli": __version__, "python": platform.python_version()}
     versions["platform"] = platform.platform()
-    devices = {"cpu": f"{_cpus()} CPUs, {torch.get_num_threads()} threads"}
+    devices = {"cpu": f"{_counted(_cpus(), 'CPU')}, {_counted(torch.get_num_threads(), 'thread')}"}
     if torch.cuda.is_available():
         devices["cuda"] = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
     if torch.backends.mps.is_available():
@@ -79,6 +79,10 @@ def collect() -> dict[str, dict[str, Any]]:
         "weights": _weights(),
         "optional": {name: _optional(name) for name in OPTIONAL},
     }
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _cpus() -> int:
@@ -143,6 +147,12 @@ def _weights() -> dict[str, Any]:
 
 def _lines(facts: dict[str, Any]) -> str:
     """Show what is short; the card's long sections are for --json."""
-    short = [f"{key}: {value}" for key, value in facts.items() if not isinstance(value, (dict, list))]
+    short = [_line(key, value) for key, value in facts.items() if not isinstance(value, (dict, list))]
     long = [key for key, value in facts.items() if isinstance(value, (dict, list))]
     return ("\n" + " " * 17).join([*short, *([f"{', '.join(long)}: see --json"] if long else [])])
+
+
+def _line(key: str, value: Any) -> str:
+    if key == "wall_clock_s" and isinstance(value, (int, float)):
+        return f"training time: {value / 3600.0:.1f} h"
+    return f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}"

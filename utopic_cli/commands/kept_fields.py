@@ -28,14 +28,15 @@ def kept_fields(scan: Scan) -> dict[str, np.ndarray]:
     Returns:
         Name to (N,) values of the scan's points: float32 where that holds what the file declares,
         else float64; colours are uint8, ``original_red`` and so on. Fields are called as in the file,
-        in lower case, without CloudCompare's ``scalar_``, and with ``original_`` where the name is one
-        of ours. Empty for meshes, whose points are drawn from the surface.
+        in lower case, without CloudCompare's ``scalar_``, and with ``original_`` where the name would be
+        one of ours, or another's, in a PLY. Empty for meshes, whose points are drawn from the surface.
 
     Raises:
         InputError: the file can't be read again, or has changed.
     """
     import numpy as np
 
+    from utopic_cli.io.ply_writer import property_name
     from utopic_cli.multiway.colours import colour_fields, colours_of
     from utopic_cli.multiway.fields import COLOURS
 
@@ -43,14 +44,17 @@ def kept_fields(scan: Scan) -> dict[str, np.ndarray]:
         name: column[scan.kept] for name, column in _values(scan).items() if not _LEFT_OUT.fullmatch(name)
     }
     kept: dict[str, np.ndarray] = {}
+    taken = {property_name(name) for name in OWN}
     colours = colour_fields(values)
     if colours:
         rgb = colours_of({name: values.pop(name) for name in colours})
         kept |= {_ORIGINAL + name: rgb[:, channel] for channel, name in enumerate(COLOURS)}
+        taken |= {property_name(name) for name in kept}
     for name, column in values.items():
         plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "field"
-        while plain in kept or plain in OWN:
+        while property_name(plain) in taken:
             plain = _ORIGINAL + plain
+        taken.add(property_name(plain))
         exact = np.can_cast(column.dtype, np.float32)
         with np.errstate(invalid="ignore"):
             kept[plain] = column.astype(np.float32 if exact else np.float64)
@@ -61,16 +65,16 @@ def _values(scan: Scan) -> dict[str, np.ndarray]:
     """Return (R,) values of every record of a scan's file by name."""
     from utopic_cli.io.files import read_bytes
     from utopic_cli.io.records import FormatError
-    from utopic_cli.multiway.fields import SAMPLE_BYTES, find_fields
+    from utopic_cli.multiway.fields import find_fields, sample_size
 
-    told = getattr(scan.document.document, "fields", None)
-    if told is not None:  # formats whose reader keeps them at hand
-        return dict(told())
-    data = read_bytes(scan.path)
-    if hashlib.sha256(data).hexdigest() != scan.sha256:
-        raise InputError(f"{scan.path}: has changed while it was aligned; run again")
     try:
-        fields = find_fields(data[:SAMPLE_BYTES], scan.format)
+        told = getattr(scan.document.document, "fields", None)
+        if told is not None:  # formats whose reader keeps them at hand
+            return dict(told(scan.records))
+        data = read_bytes(scan.path)
+        if hashlib.sha256(data).hexdigest() != scan.sha256:
+            raise InputError(f"{scan.path}: has changed while it was aligned; run again")
+        fields = find_fields(data[: sample_size(data, scan.format, len(data))], scan.format)
         return fields.read(data, scan.records, list(fields.dtypes)) if fields.dtypes else {}
     except (FormatError, ValueError, KeyError):
         # A layout that only the reader of points knows: what it says of the points is not told here.

@@ -64,14 +64,23 @@ def plan_outputs(
     from utopic_cli.io.transformation import SUFFIXES, form_of
 
     if output is not None and form_of(output) is None:
+        if output.is_dir():
+            raise UsageError(f"{output}: is a folder; did you mean --out-dir?")
         known = ", ".join(SUFFIXES)
-        raise UsageError(f"{output}: the transformation's form is told by its suffix; use one of {known}")
+        moved = "; for the moved scan use --aligned" if output.suffix.lower() == source.suffix.lower() else ""
+        raise UsageError(
+            f"{output}: the transformation's form is told by its suffix; use one of {known}{moved}"
+        )
     if aligned is not None and aligned.suffix.lower() != source.suffix.lower():
         raise UsageError(
             f"{aligned}: --aligned keeps the source's format; let the name end in '{source.suffix}'"
         )
     if merged is not None and merged.suffix.lower() != ".ply":
         raise UsageError(f"{merged}: --merged is written as PLY; let the name end in .ply")
+    if page is not None and page.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{page}: --html writes a page; let the name end in .html")
+    if report is not None and report.suffix.lower() != ".json":
+        raise UsageError(f"{report}: --report is written as JSON; let the name end in .json")
     files = [("transformation", output), ("aligned", aligned), ("merged", merged)]
     if out_dir is not None:
         files.append(("transformation", out_dir / "transformation.txt"))
@@ -98,7 +107,7 @@ def check_outputs(plan: OutputPlan, inputs: Iterable[Path], overwrite: bool) -> 
         OutputError: an output is also an input or named twice, exists and may not be replaced, or
             its folder is missing or not writable.
     """
-    from utopic_cli.io.output import check_writable
+    from utopic_cli.io.output import check_folder, check_writable
 
     read = {_identity(path): path for path in inputs}
     seen: set[Any] = set()
@@ -109,14 +118,9 @@ def check_outputs(plan: OutputPlan, inputs: Iterable[Path], overwrite: bool) -> 
         if identity in seen:
             raise OutputError(f"{path}: named for two outputs; give each its own file")
         seen.add(identity)
+    for folder in plan.folders:
+        check_folder(folder)
     missing = [folder for folder in plan.folders if not folder.exists()]
-    for folder in missing:
-        if folder.is_symlink():
-            raise OutputError(f"{folder}: is a link to nothing; make the folder it names, or name another")
-        if not folder.parent.is_dir():
-            raise OutputError(f"{folder}: the folder {folder.parent} does not exist; make it first")
-        if not os.access(folder.parent, os.W_OK | os.X_OK):
-            raise OutputError(f"{folder}: can't be made, {folder.parent} is not writable")
     check_writable([path for path in plan.paths if path.parent not in missing], overwrite)
 
 

@@ -33,7 +33,10 @@ def train(
         ),
     ] = PROCEDURAL,
     config: Annotated[
-        str, typer.Option(metavar="NAME|FILE.toml", help="Settings: default, paper, or a file of your own.")
+        str,
+        typer.Option(
+            metavar="NAME|FILE.toml", help="Settings: default, paper, variants, or a file of your own."
+        ),
     ] = "default",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the run's checkpoint.")] = False,
     minutes: Annotated[
@@ -71,27 +74,32 @@ def train(
         from utopic_cli.commands.training_view import TrainingView
         from utopic_cli.model.weights import choose_device, load_weights
         from utopic_cli.training.config import read_training_config
+        from utopic_cli.training.pace import InterruptedRun
         from utopic_cli.training.trainer import train as run_training
 
         settings = read_training_config(config)
         place = choose_device(device)
         first = load_weights(start_from)[0].state_dict() if start_from else None
-    shapes = load_library(data, console)
+    shapes = load_library(data, console, resume)
     console.line(f"training on {place} with {len(shapes)} shapes")
-    with TrainingView(console) as view:
-        written = run_training(
-            settings,
-            shapes.select("train"),
-            shapes.select("val"),
-            out,
-            resume=resume,
-            minutes=minutes,
-            device=place,
-            workers=workers,
-            synthesis=synthesis,
-            start_from=first,
-            progress=view.show,
-        )
+    try:
+        with TrainingView(console) as view:
+            written = run_training(
+                settings,
+                shapes.select("train"),
+                shapes.select("val"),
+                out,
+                resume=resume,
+                minutes=minutes,
+                device=place,
+                workers=workers,
+                synthesis=synthesis,
+                start_from=first,
+                progress=view.show,
+            )
+    except InterruptedRun as stop:
+        console.line(f"saved {out / RUN_FILES[0]} and exported {stop.weights}; go on: the same with --resume")
+        raise
     for line in (view.outcome(), *describe_files(out, written)):
         console.line(line)
 
@@ -115,12 +123,13 @@ def check_run(out: Path, resume: bool) -> None:
     check_writable([there / RUN_FILES[0]], overwrite=True)
 
 
-def load_library(data: str, console: Console) -> ShapeLibrary:
-    """Return the shapes to train on, and say which were skipped.
+def load_library(data: str, console: Console, resume: bool = False) -> ShapeLibrary:
+    """Return the shapes to train on, and say which were skipped; when resuming, how many.
 
     Args:
         data: ``procedural``, a folder of shapes, or ``modelnet40:DIR``.
         console: told how far it is.
+        resume: whether the run was told before which were skipped.
 
     Raises:
         InputError: nothing usable is there.
@@ -132,7 +141,9 @@ def load_library(data: str, console: Console) -> ShapeLibrary:
         step("looking")
         shapes = open_shapes(data, progress=lambda done, of, name: step(f"{done}/{of} shapes: {name}"))
     skipped = describe_skipped(shapes)
-    if skipped:
+    if skipped and resume:
+        console.line(skipped.split(":")[0])
+    elif skipped:
         console.warnings((skipped,))
     return shapes
 

@@ -107,7 +107,12 @@ def _times(record: Record, since: float) -> str:
     """Return the time taken and left, ``since`` seconds after the record."""
     text = clock(record["elapsed_s"] + since)
     left = record.get("left_s")
-    return text if left is None else f"{text}, about {clock(left - since)} left"
+    if left is None:
+        return text
+    whole = (record["of"] - record["pairs"]) / max(record["pairs_per_s"], 1e-9)
+    if left < 0.9 * whole:  # --minutes ends it before all pairs are seen
+        return f"{text}, stops in {clock(left - since)}"
+    return f"{text}, about {clock(left - since)} left"
 
 
 def _change(name: str, value: float, before: Record) -> tuple[str, str]:
@@ -117,7 +122,7 @@ def _change(name: str, value: float, before: Record) -> tuple[str, str]:
     change = value - before[name]
     size = f"{100 * abs(change):.1f}" if is_share(name) else f"{abs(change):.3g}"
     if not float(size):  # too small to show
-        return " =", "dim"
+        return " unchanged", "dim"
     better = (change > 0) == is_share(name)  # what is no share is an error
     return f" {'▲' if change > 0 else '▼'}{size}", "green" if better else "yellow"
 

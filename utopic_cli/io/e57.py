@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,14 @@ _NORMALS = ("normalX", "normalY", "normalZ")  # of the extension for surface nor
 
 
 @dataclass(frozen=True)
-class _E57:
+class E57Document:
+    """A file kept whole.
+
+    Attributes:
+        file: its layers.
+        root: of its XML section.
+    """
+
     file: E57File
     root: Node
 
@@ -38,29 +46,46 @@ class _E57:
             xml = xml[:start] + instead + xml[end:]
         return self.file.with_xml(xml)
 
-    def fields(self) -> dict[str, np.ndarray]:
-        """Return (R,) float64 values of every record by name: those of ``_FIELDS`` that all scans have."""
-        tables = []
+    def field_names(self) -> list[str]:
+        """Return what all scans say of their points, under the names of ``_FIELDS``.
+
+        Raises:
+            FormatError: the XML section is not sound.
+        """
+        scans = [streams for _, _, streams in self._told()]
+        return [name for name in _FIELDS.values() if scans and all(name in streams for streams in scans)]
+
+    def fields(self, records: int) -> dict[str, np.ndarray]:
+        """Return (R,) float64 values of every record for each of ``field_names``.
+
+        Args:
+            records: how many the file was found to have.
+
+        Raises:
+            FormatError: the file promises another number, or its columns are not sound.
+        """
+        names, scans = self.field_names(), list(self._told())
+        promised = sum(count for _, count, _ in scans)
+        if promised != records:
+            raise FormatError(f"promises {promised} E57 points but holds {records}; copy it again")
+        tables = [
+            read_columns(self.file, section, count, [streams[name] for name in names])
+            for section, count, streams in scans
+            if names
+        ]
+        return {name: np.concatenate(columns) for name, columns in zip(names, zip(*tables))}
+
+    def _told(self) -> Iterator[tuple[int, int, dict[str, Stream]]]:
+        """Yield the section, the number of points, and the columns of ``_FIELDS`` of scans with points."""
         for entry in _entries(self.root, "data3D"):
             points = entry.child("points")
             prototype = None if points is None else points.child("prototype")
             count = 0 if points is None else _integer(points, "recordCount", 0)
             if points is None or prototype is None or count <= 0:
                 continue
-            there = {
-                node.name: _stream(i, node)
-                for i, node in enumerate(prototype.children)
-                if node.name in _FIELDS
-            }
-            if not there:
-                return {}
-            section = self.file.place(_integer(points, "fileOffset", -1))
-            tables.append(dict(zip(there, read_columns(self.file, section, count, list(there.values())))))
-        return {
-            plain: np.concatenate([table[name] for table in tables])
-            for name, plain in _FIELDS.items()
-            if all(name in table for table in tables)
-        }
+            nodes = enumerate(prototype.children)
+            streams = {_FIELDS[node.name]: _stream(i, node) for i, node in nodes if node.name in _FIELDS}
+            yield self.file.place(_integer(points, "fileOffset", -1)), count, streams
 
 
 def read_e57(data: bytes) -> Records:
@@ -79,8 +104,18 @@ def read_e57(data: bytes) -> Records:
     whole = [normals for _, normals in scans if normals is not None]
     warnings = (f"holds {len(scans)} scans, taken as one by their poses",) if len(scans) > 1 else ()
     return Records(
-        points, np.concatenate(whole) if len(whole) == len(scans) else None, _E57(file, root), warnings
+        points, np.concatenate(whole) if len(whole) == len(scans) else None, E57Document(file, root), warnings
     )
+
+
+def e57_document(data: bytes) -> E57Document:
+    """Open a file whose points are read elsewhere: its checksums are not looked at again.
+
+    Raises:
+        FormatError: the file is not sound.
+    """
+    file = open_e57(data, check=False)
+    return E57Document(file, parse_xml(file.xml))
 
 
 def _entries(root: Node, group: str) -> list[Node]:
@@ -106,7 +141,10 @@ def _read_scan(file: E57File, entry: Node) -> tuple[np.ndarray, np.ndarray | Non
     normals = fields.keys() >= set(_NORMALS)
     wanted += _NORMALS if normals else ()
     section = file.place(_integer(points, "fileOffset", -1))
-    columns = dict(zip(wanted, read_columns(file, section, count, [_stream(*fields[n]) for n in wanted])))
+    streams = {name: _stream(*fields[name]) for name in wanted}
+    if not any(streams[name].bits for name in names):  # and nothing holds against the promised number
+        raise FormatError("has E57 points that are all equal; export it again")
+    columns = dict(zip(wanted, read_columns(file, section, count, list(streams.values()))))
     values = np.stack([columns[name] for name in names], axis=1)
     if names is _SPHERICAL:
         values = _from_spherical(values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from pathlib import Path
 
@@ -36,6 +37,12 @@ def read_bytes(path: Path) -> bytes:
     if not data:
         raise InputError(f"{path}: the file is empty; export or copy it again")
     return data
+
+
+def printable(text: str) -> str:
+    """Return text that any terminal and file takes: bytes of a file's name that are no UTF-8 as %E9."""
+    # They arrive as lone surrogates.
+    return re.sub("[\ud800-\udfff]", lambda found: f"%{ord(found[0]) & 0xFF:02X}", text)
 
 
 def _require_regular(path: Path, mode: int) -> None:

@@ -56,6 +56,39 @@ def check_writable(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> 
             raise _explained(path, error) from None
 
 
+def check_folder(folder: Path) -> None:
+    """Make sure, before any work, that a folder is there or can be made; leaves nothing behind.
+
+    Args:
+        folder: only it may be missing, not the folder it lies in.
+
+    Raises:
+        OutputError: it is a file or can't be made.
+    """
+    try:
+        if not stat.S_ISDIR(folder.stat().st_mode):
+            raise OutputError(f"{folder}: is a file; name a folder")
+        return
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise _cant_be_made(folder, error) from None
+    if folder.is_symlink():
+        raise OutputError(f"{folder}: is a link to nothing; make the folder it names, or name another")
+    if not folder.parent.is_dir():
+        raise OutputError(f"{folder}: the folder {folder.parent} does not exist; make it first")
+    try:  # under another name: the folder itself may be what another run is about to make
+        probe = _temporary(folder)
+        probe.mkdir()
+        probe.rmdir()
+    except OSError as error:
+        raise _cant_be_made(folder, error) from None
+
+
+def _cant_be_made(folder: Path, error: OSError | ValueError) -> OutputError:
+    return OutputError(f"{folder}: can't be made ({_system_says(error)}); choose another place")
+
+
 def write_atomically(path: str | os.PathLike[str], data: bytes, *, overwrite: bool) -> None:
     """Write a file whole or not at all, even if interrupted or out of space.
 
@@ -184,5 +217,12 @@ def _rename_to_new(temporary: Path, target: Path) -> None:
 
 def _explained(path: Path, error: OSError | ValueError) -> OutputError:
     number = error.errno if isinstance(error, OSError) else None
-    reason = _REASONS.get(number or 0, f"can't be written ({error}); choose another place")
+    reason = _REASONS.get(number or 0)
+    # Some file systems say ENOENT of a folder that exists but takes no files.
+    if reason is None or (number == errno.ENOENT and os.path.isdir(os.path.dirname(os.path.realpath(path)))):
+        reason = f"can't be written ({_system_says(error)}); choose another place"
     return OutputError(f"{path}: {reason}")
+
+
+def _system_says(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)

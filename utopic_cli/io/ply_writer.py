@@ -39,7 +39,8 @@ def scalar_cloud_ply(
         shown: name of the scalar field that gives the colours: put first, and repeated for MeshLab.
 
     Raises:
-        ValueError: lengths differ, or a name, type or comment does not fit a PLY header.
+        ValueError: lengths differ, a name, type or comment does not fit a PLY header, or two names
+            become one property.
     """
     for comment in comments:
         if not comment.isprintable():
@@ -49,7 +50,10 @@ def scalar_cloud_ply(
     columns = {name: np.asarray(points[:, axis], np.float64) for axis, name in enumerate("xyz")}
     columns |= {name: np.asarray(colours[:, channel], np.uint8) for channel, name in enumerate(_COLOURS)}
     order = scalars if shown is None else [shown, *(name for name in scalars if name != shown)]
-    columns |= {property_name(name): np.asarray(scalars[name]) for name in order}
+    named = {property_name(name): np.asarray(scalars[name]) for name in order}
+    if len(named) < len(scalars):
+        raise ValueError(f"of {', '.join(scalars)} two become one PLY property")
+    columns |= named
     if shown is not None:
         columns[SHOWN] = np.asarray(scalars[shown])
     for name, values in columns.items():

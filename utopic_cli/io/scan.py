@@ -94,7 +94,7 @@ def read_scan(path: str | os.PathLike[str], *, seed: int = 0, to_align: bool = T
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES and not path.is_dir():
+    if suffix not in SUFFIXES and os.path.isfile(path):
         raise InputError(f"{path}: is no known scan format; use one of {' '.join(SUFFIXES)}")
     data = read_bytes(path)
     kind = suffix[1:]

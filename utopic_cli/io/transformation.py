@@ -50,6 +50,8 @@ SUFFIXES = tuple(FORM_OF_SUFFIX)
 
 # How far the rotation may be from orthonormal: files with few digits are common.
 _TOLERANCE = 1e-3
+# Within this it is as exact as doubles are: taken as it is, so that writing it again gives the same digits.
+_EXACT = 1e-12
 _LARGEST_FILE = 1 << 26  # bytes: a trajectory of some 100,000 poses
 
 
@@ -139,15 +141,17 @@ def read_transformation(path: str | os.PathLike[str]) -> np.ndarray:
     rows of numbers, told by their number and length.
 
     Returns:
-        (4, 4) float64 with its rotation projected to the nearest exact one.
+        (4, 4) float64 with its rotation projected to the nearest exact one, unless it is one to 1e-12.
 
     Raises:
         InputError: the file can't be read, holds no transformation or several, or what it holds
             is not rigid within 1e-3 (it scales, shears or mirrors).
     """
     file, entry = split_entry(path)
-    if form_of(file) is None and not file.is_dir():
-        raise InputError(f"{file}: is no transformation file by its name; use {', '.join(SUFFIXES)}")
+    if form_of(file) is None and os.path.isfile(file):
+        poses = file.with_suffix(".json")
+        table = f"; a batch's are named as in '{poses}#NAME'" if file.name.lower() == "poses.csv" else ""
+        raise InputError(f"{file}: is no transformation file by its name; use {', '.join(SUFFIXES)}{table}")
     data = read_bytes(file)
     if len(data) > _LARGEST_FILE:
         raise InputError(f"{file}: is too large for a transformation; check what it is")
@@ -225,13 +229,16 @@ def _rigid(matrix: np.ndarray) -> np.ndarray:
     if not np.isfinite(matrix).all() or np.abs(matrix[3] - [0, 0, 0, 1]).max() > _TOLERANCE:
         raise FormatError("is no rigid transformation: the last row must be 0 0 0 1, and all numbers finite")
     rotation = matrix[:3, :3]
-    if np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > _TOLERANCE:
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max() if np.abs(rotation).max() <= 2 else np.inf
+    if off > _TOLERANCE:
         raise FormatError("is no rigid transformation: it scales or shears; give a rotation and translation")
     if np.linalg.det(rotation) < 0:
         raise FormatError("is no rigid transformation: it mirrors; give a rotation and translation")
-    u, _, vt = np.linalg.svd(rotation)
+    if off > _EXACT:
+        u, _, vt = np.linalg.svd(rotation)
+        rotation = u @ vt
     rigid = np.eye(4)
-    rigid[:3, :3] = u @ vt
+    rigid[:3, :3] = rotation
     rigid[:3, 3] = matrix[:3, 3]
     return rigid
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 Record = dict[str, Any]
 
 RECORD_VERSION = 2
+MOST_PROBLEMS_SAID = 10
 CONTENT = {"scans": "description", "pairs": "report"}
 
 
@@ -133,7 +134,9 @@ class _Batch:
         if not any(record["status"] == "done" for record in records.values()):
             problems = [scan.problem for scan in self._files if scan.problem]
             problems += [record["problem"] for record in records.values()]
-            raise InputError(f"none of {len(self._files)} scans can be read; the first: {problems[0]}")
+            said = " | ".join(problems[:MOST_PROBLEMS_SAID])
+            more = f" | and {len(problems) - MOST_PROBLEMS_SAID} more" * (len(problems) > MOST_PROBLEMS_SAID)
+            raise InputError(f"none of {len(self._files)} scans can be read: {said}{more}")
         return records
 
     def _align(

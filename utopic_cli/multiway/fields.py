@@ -1,7 +1,7 @@
 """What a scan file says of its points besides where they are: named numbers, one per record.
 
-Which fields a file has is told by its beginning, so that all files of a batch can be asked before
-any is read whole.
+Which fields a file has is told by its beginning (E57: its end), so that all files of a batch can be
+asked before any is read in earnest.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from utopic_cli.io import lzf
 from utopic_cli.io.ascii_table import is_number, parse_table
+from utopic_cli.io.e57 import e57_document
 from utopic_cli.io.las import las_block
 from utopic_cli.io.las_header import parse_header as las_header
 from utopic_cli.io.ply_header import parse_header
@@ -27,9 +28,10 @@ PACKED = "rgb"
 """PCD's three colours in the bits of one number."""
 
 SAMPLE_BYTES = 1 << 20
-"""A file's fields show in no more than this of its beginning."""
+"""Of most files this beginning says the fields; see ``sample_size``."""
 
 _SAMPLE_LINES = 500
+_LAS_POINTS = 96  # place in a LAS file of the number of bytes before its points
 _DOUBLE = np.dtype("<f8")
 _COORDINATES = ("x", "y", "z")
 _SPELLINGS = {
@@ -54,11 +56,25 @@ class Fields:
     read: Callable[[bytes, int, Sequence[str]], Values] = lambda data, records, names: {}
 
 
+def sample_size(start: bytes, kind: str, size: int) -> int:
+    """Tell how many of a file's bytes ``find_fields`` takes.
+
+    Args:
+        start: the first ``SAMPLE_BYTES`` of a file, or the whole.
+        kind: its suffix without the dot, lower case.
+        size: of the file, in bytes.
+    """
+    if kind == "e57":  # what it holds is said at its end
+        return size
+    says = int.from_bytes(start[_LAS_POINTS : _LAS_POINTS + 4], "little") if kind in ("las", "laz") else 0
+    return min(size, max(SAMPLE_BYTES, says))
+
+
 def find_fields(sample: bytes, kind: str) -> Fields:
     """Tell a file's fields from its beginning.
 
     Args:
-        sample: the first bytes of a sound file, ``SAMPLE_BYTES`` of them or the whole.
+        sample: the first bytes of a sound file, ``sample_size`` of them.
         kind: its suffix without the dot, lower case.
 
     Returns:
@@ -76,6 +92,8 @@ def find_fields(sample: bytes, kind: str) -> Fields:
         return _obj_fields(sample)
     if kind in ("las", "laz"):
         return _las_fields(sample)
+    if kind == "e57":
+        return _e57_fields(sample)
     return _text_fields(sample) if kind in ("xyz", "txt", "pts", "asc", "csv") else Fields()
 
 
@@ -154,6 +172,14 @@ def _las_fields(sample: bytes) -> Fields:
         return {n: np.ndarray((records,), f.dtype, block, f.place, step) for n, f in wanted.items()}
 
     return Fields({name: place.dtype for name, place in places.items()}, read)
+
+
+def _e57_fields(sample: bytes) -> Fields:
+    def read(data: bytes, records: int, names: Sequence[str]) -> Values:
+        found = e57_document(data).fields(records)
+        return {name: found[name] for name in names}
+
+    return Fields(dict.fromkeys(e57_document(sample).field_names(), _DOUBLE), read)
 
 
 def _pcd_fields(sample: bytes) -> Fields:

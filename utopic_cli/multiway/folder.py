@@ -25,14 +25,18 @@ def make_folder(folder: Path) -> None:
         raise OutputError(f"{folder}: the folder can't be made ({error.strerror})") from None
 
 
+def earlier(out: Path) -> list[Path]:
+    """Return what an earlier batch left: its records, then its results."""
+    return [path for kind in KINDS for path in (out / kind).glob("*.json")] + results(out)
+
+
 def check_earlier(out: Path) -> None:
     """Refuse to mix with an earlier batch.
 
     Raises:
         OutputError: there is one.
     """
-    earlier = [path for kind in KINDS for path in (out / kind).glob("*.json")] + results(out)
-    if earlier:
+    if earlier(out):
         raise OutputError(
             f"{out}: holds an earlier batch; pass --resume to go on with it or --overwrite to begin anew"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -15,10 +16,11 @@ from utopic_cli.errors import InputError
 from utopic_cli.geometry.rigid import apply
 from utopic_cli.io.files import read_bytes
 from utopic_cli.io.output import open_atomically
+from utopic_cli.io.ply_writer import property_name
 from utopic_cli.io.records import FormatError
 from utopic_cli.io.scan import Scan, read_scan
 from utopic_cli.multiway.colours import colour_fields, colours_of, has_colours, scan_colour
-from utopic_cli.multiway.fields import COLOURS, PACKED, SAMPLE_BYTES, Fields, find_fields
+from utopic_cli.multiway.fields import COLOURS, PACKED, SAMPLE_BYTES, Fields, find_fields, sample_size
 from utopic_cli.multiway.scans import ScanFile
 
 _DIGITS = 18  # room for the number of points, which is known at the end
@@ -27,6 +29,7 @@ _GREY = 190
 _NO_SCALARS = {"nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "normalx", "normaly", "normalz"}
 _NO_SCALARS |= {*COLOURS, PACKED, "alpha", "a", "diffuse_alpha"}
 _TYPES = {"<f4": "float", "<f8": "double"}
+_SCAN = property_name("scan")
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class _Columns:
 
     Attributes:
         fields: of each scan's file, by scan.
-        scalars: what most files have: the name there, the name in the merged file, and its type.
+        scalars: what most files have: the name there, the property of the merged file, and its type.
         coloured: whether any scan has colours.
     """
 
@@ -46,7 +49,7 @@ class _Columns:
     @property
     def layout(self) -> np.dtype:
         """A point's record."""
-        own = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("rgb", "u1", (3,)), ("scan", "<f4")]
+        own = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("rgb", "u1", (3,)), (_SCAN, "<f4")]
         return np.dtype([*own, *((name, kind) for _, name, kind in self.scalars)])
 
 
@@ -60,7 +63,7 @@ def write_merged(
     overwrite: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> int:
-    """Write the points of a group in its world frame; the field ``scan`` says whose a point is.
+    """Write the points of a group in its world frame; the field ``scalar_scan`` says whose a point is.
 
     A scan with colours in its file keeps them; the points of one without get a colour of the scan's
     own if no scan has any, grey otherwise. Scalar fields (intensity and the like) that more than half
@@ -69,7 +72,7 @@ def write_merged(
 
     Args:
         path: a PLY, binary, coordinates in double precision.
-        group: T_world_scan (4, 4) by scan; numbers are those of the field ``scan``.
+        group: T_world_scan (4, 4) by scan; numbers are those of the field ``scalar_scan``.
         files: of the scans.
         seed: of the points drawn from meshes.
         voxel: keep one point, the first, in each cell of this edge length, in the files' unit.
@@ -126,24 +129,26 @@ def _columns(files: Mapping[int, ScanFile], group: Sequence[int]) -> _Columns:
     # In the order of the first file that has them, so that like runs give like files.
     order = dict.fromkeys(name for found in fields.values() for name in found.dtypes)
     scalars = []
-    taken = {"x", "y", "z", "scan", *COLOURS}
+    taken = {_SCAN}
     for name in order:
         if 2 * having[name] <= len(group):
             continue
         plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "field"
-        while plain in taken:
+        while property_name(plain) in taken:
             plain += "_"
-        taken.add(plain)
+        taken.add(property_name(plain))
         exact = all(np.can_cast(kind, np.float32) for kind in kinds[name])
-        scalars.append((name, plain, "<f4" if exact else "<f8"))
+        scalars.append((name, property_name(plain), "<f4" if exact else "<f8"))
     return _Columns(fields, scalars, any(has_colours(found.dtypes) for found in fields.values()))
 
 
 def _fields_of(path: Path) -> Fields:
     try:
+        kind = path.suffix.lower()[1:]
         with open(path, "rb") as stream:
             sample = stream.read(SAMPLE_BYTES)
-        return find_fields(sample, path.suffix.lower()[1:])
+            more = sample_size(sample, kind, os.fstat(stream.fileno()).st_size) - len(sample)
+            return find_fields(sample + stream.read(max(more, 0)), kind)
     except OSError as error:
         raise InputError(f"{path}: can't be read any more ({error.strerror}); run again") from None
     except (FormatError, ValueError, KeyError):
@@ -169,10 +174,10 @@ def _table(scan: Scan, number: int, transformation: np.ndarray, columns: _Column
         table["rgb"] = colours_of({name: values[name][kept] for name in colours})
     else:
         table["rgb"] = _GREY if columns.coloured else scan_colour(number)
-    table["scan"] = number
-    for name, plain, _ in columns.scalars:
+    table[_SCAN] = number
+    for name, written, _ in columns.scalars:
         with np.errstate(invalid="ignore"):
-            table[plain] = values[name][kept] if name in values else np.nan
+            table[written] = values[name][kept] if name in values else np.nan
     return table
 
 
@@ -196,8 +201,6 @@ def _header(count: int, comments: list[str], columns: _Columns) -> bytes:
     lines += [f"comment {line.encode('ascii', 'backslashreplace').decode()}" for line in comments]
     lines += [f"element vertex {count}", *(f"property double {name}" for name in "xyz")]
     lines += [f"property uchar {name}" for name in COLOURS]
-    lines += [
-        "property float scan",
-        *(f"property {_TYPES[kind]} {name}" for _, name, kind in columns.scalars),
-    ]
+    lines += [f"property float {_SCAN}"]
+    lines += [f"property {_TYPES[kind]} {name}" for _, name, kind in columns.scalars]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
+from utopic_cli.io.output import check_folder
+from utopic_cli.multiway import folder
 from utopic_cli.multiway import pairs as choice
 from utopic_cli.multiway.journal import KINDS
 from utopic_cli.multiway.scans import ScanList, find_scans
@@ -55,11 +57,13 @@ class BatchPlan:
         scans: the inputs.
         usable: numbers of the scans to align: those that could be hashed, copies left out.
         first: the pairs to begin with; None where the network has to describe the scans first.
+        earlier: the records and results of an earlier batch in ``out_dir``.
     """
 
     scans: ScanList
     usable: tuple[int, ...]
     first: tuple[choice.Pair, ...] | None
+    earlier: tuple[Path, ...] = ()
 
 
 def plan_batch(request: BatchRequest) -> BatchPlan:
@@ -67,6 +71,7 @@ def plan_batch(request: BatchRequest) -> BatchPlan:
 
     Raises:
         InputError: there are too few files, or the list of pairs is not sound.
+        OutputError: ``out_dir`` is a file or can't be made.
         UsageError: an option names nothing known, or results would land among the scans.
     """
     for given in request.inputs:
@@ -74,15 +79,17 @@ def plan_batch(request: BatchRequest) -> BatchPlan:
             raise UsageError(f"{given}: holds the scans; choose another --out-dir, or a folder inside it")
     if request.resume and request.overwrite:
         raise UsageError("--resume keeps what is done and --overwrite discards it; choose one")
+    check_folder(request.out_dir)
     scans = find_scans(request.inputs)
     _keep_apart(scans, request.out_dir)
     usable = tuple(i for i, scan in enumerate(scans.scans) if scan.sha256 and scan.copy_of is None)
-    return BatchPlan(scans, usable, first_pairs(request.pairs, scans, usable))
+    earlier = tuple(folder.earlier(request.out_dir))
+    return BatchPlan(scans, usable, first_pairs(request.pairs, scans, usable), earlier)
 
 
 def _keep_apart(scans: ScanList, out_dir: Path) -> None:
     """Refuse scans that lie where results are written, and replaced."""
-    own = {os.path.realpath(folder) for folder in (out_dir, *(out_dir / kind for kind in KINDS))}
+    own = {os.path.realpath(place) for place in (out_dir, *(out_dir / kind for kind in KINDS))}
     for scan in scans.scans:
         if os.path.realpath(scan.path.parent) in own:
             raise UsageError(f"{scan.path}: lies where the results go; choose another --out-dir")

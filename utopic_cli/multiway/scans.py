@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from utopic_cli.errors import InputError
+from utopic_cli.io.files import printable
 from utopic_cli.io.scan import SUFFIXES
 
 LONGEST_NAME = 80
@@ -80,9 +81,10 @@ def find_scans(inputs: Sequence[Path]) -> ScanList:
             once[place] = (path, doubtful)
     if len(once) < 2:
         where = ", ".join(map(str, inputs))
-        raise InputError(
-            f"{where}: holds {len(once)} scan files; a batch needs at least two ({' '.join(SUFFIXES)})"
-        )
+        if once and not any(given.is_dir() for given in inputs):
+            raise InputError(f"{where}: only one scan given; a batch needs at least two")
+        count = "only one scan file" if once else "no scan files"
+        raise InputError(f"{where}: holds {count}; a batch needs at least two ({' '.join(SUFFIXES)})")
     files = list(once.values())
     names = distinct_names([path for path, _ in files])
     scans: list[ScanFile] = []
@@ -145,9 +147,7 @@ def _is_scan(path: Path) -> bool:
 
 def _plain(text: str) -> str:
     """Return a name that every file system and text file can hold."""
-    # Bytes of a file name that are no UTF-8 arrive as lone surrogates.
-    text = re.sub("[\ud800-\udfff]", lambda found: f"%{ord(found[0]) & 0xFF:02X}", text)
-    text = "".join(c if c.isprintable() and c not in '<>:"/\\|?*' else "_" for c in text)
+    text = "".join(c if c.isprintable() and c not in '<>:"/\\|?*' else "_" for c in printable(text))
     return re.sub("-{2,}", "-", _cut(text, LONGEST_NAME)).strip("-. ") or "scan"  # "--" joins two names
 
 

@@ -23,7 +23,13 @@ from utopic_cli.synthesis.mesh_form import PackedMesh, packed_mesh
 from utopic_cli.synthesis.modelnet40 import find_modelnet40, read_modelnet40
 from utopic_cli.synthesis.reconstruction import mesh_from_points
 from utopic_cli.synthesis.scanobjectnn import find_scanobjectnn, read_scanobjectnn
-from utopic_cli.synthesis.shape_files import CLOUD_SUFFIXES, MESH_SUFFIXES, find_shape_files, read_shape
+from utopic_cli.synthesis.shape_files import (
+    CLOUD_SUFFIXES,
+    MESH_SUFFIXES,
+    NO_SHAPE,
+    find_shape_files,
+    read_shape,
+)
 from utopic_cli.synthesis.shapes import ShapeLibrary, load_shapes, packed_files, procedural_shapes
 from utopic_cli.synthesis.surface import DegenerateShape
 
@@ -107,13 +113,18 @@ def describe_data(data: str) -> str:
 
 
 def describe_skipped(library: ShapeLibrary, most: int = 3) -> str | None:
-    """Return which shapes were skipped and why as one line, or None if all were used."""
-    count = len(library.skipped)
+    """Return which shapes were skipped and why as one line, or None if all were used.
+
+    Text that is no shape at all (``NO_SHAPE``) is only counted, and deserves no line of its own.
+    """
+    shapes = [(name, reason) for name, reason in library.skipped if reason != NO_SHAPE]
+    count, others = len(shapes), len(library.skipped) - len(shapes)
     if not count:
         return None
-    named = "; ".join(f"{name}: {reason}" for name, reason in library.skipped[:most])
+    named = "; ".join(f"{name}: {reason}" for name, reason in shapes[:most])
     rest = f"; and {count - most} more" if count > most else ""
-    return f"skipped {count} shape{'s' if count > 1 else ''}: {named}{rest}"
+    notes = f"; text files left out: {others}" if others else ""
+    return f"skipped {count} shape{'s' if count > 1 else ''}: {named}{rest}{notes}"
 
 
 def cache_folder() -> Path:

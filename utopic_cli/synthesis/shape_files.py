@@ -23,9 +23,14 @@ from utopic_cli.synthesis.reconstruction import mesh_from_points
 from utopic_cli.synthesis.surface import DegenerateShape
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf", ".dae")
-CLOUD_SUFFIXES = (".pcd", ".xyz", ".txt", ".pts", ".asc", ".csv")
+TEXT_SUFFIXES = (".txt", ".asc", ".csv")
+CLOUD_SUFFIXES = (".pcd", ".xyz", ".pts", *TEXT_SUFFIXES)
 # Many files of the ModelNet40 meshes lack the line break after the first word.
 _GLUED_OFF = re.compile(rb"\A\s*OFF(?=\d)")
+NO_SHAPE = "is text without points, no shape"
+"""Reason for not using a file that nobody would take for a shape: a readme, a licence."""
+
+_THREE_NUMBERS = re.compile(rb"(?<![\w.])(?:[-+]?\.?\d[\d.eE+-]*[ \t,;]+){2}[-+]?\.?\d")
 _PACKAGES = {"dae": "pycollada"}
 
 
@@ -74,11 +79,19 @@ def read_shape(path: Path) -> tuple[np.ndarray, np.ndarray]:
         check_points(finite, len(points))
         return mesh_from_points(finite)
     except InputError as error:
+        if f".{kind}" in TEXT_SUFFIXES and path.is_file() and _is_prose(path.read_bytes()):
+            raise DegenerateShape(NO_SHAPE) from error
         raise DegenerateShape(str(error).removeprefix(f"{path}: ")) from error
     except FormatError as error:
         raise DegenerateShape(str(error)) from error
     except MemoryError as error:
         raise DegenerateShape("is too large for this machine's memory") from error
+
+
+def _is_prose(text: bytes) -> bool:
+    """Tell whether a file begins with text (not empty) of which no line holds three numbers in a row."""
+    start = text[:4096]
+    return bool(start.strip()) and b"\0" not in start and _THREE_NUMBERS.search(start) is None
 
 
 def _read_strictly(data: bytes, kind: str) -> np.ndarray | None:

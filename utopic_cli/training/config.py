@@ -1,4 +1,4 @@
-"""Settings of a training run, read from TOML; two ship in the package: ``default`` and ``paper``."""
+"""Settings of a training run, read from TOML; ``configs`` has those that ship in the package."""
 
 from __future__ import annotations
 

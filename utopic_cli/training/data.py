@@ -8,6 +8,7 @@ worker keeps the block it has made.
 
 from __future__ import annotations
 
+import signal
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -208,7 +209,7 @@ def batch_loader(
         num_workers=workers,
         prefetch_factor=8 if workers else None,
         collate_fn=_as_it_is,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_start_worker,
         pin_memory=pinned,
     )
 
@@ -217,5 +218,12 @@ def _as_it_is(pair: Any) -> Any:
     return pair
 
 
-def _one_thread(_: int) -> None:
+def _start_worker(_: int) -> None:
+    """One thread, and deaf to the signals that a whole group of processes gets.
+
+    The parent finishes its step with the workers' pairs, saves, and tells them to end; where it is
+    gone, they see so by themselves.
+    """
     torch.set_num_threads(1)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)

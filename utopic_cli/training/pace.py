@@ -8,8 +8,22 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
+
+
+class InterruptedRun(KeyboardInterrupt):
+    """Ctrl-C ended a run after it was saved and exported.
+
+    Attributes:
+        weights: path of the exported weights.
+    """
+
+    def __init__(self, weights: Path) -> None:
+        """Say where the weights are."""
+        super().__init__()
+        self.weights = weights
 
 
 @dataclass(frozen=True)

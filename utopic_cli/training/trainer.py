@@ -21,7 +21,7 @@ from utopic_cli.training.data import BatchOrder, SynthesisedPairs, batch_loader
 from utopic_cli.training.journal import Journal
 from utopic_cli.training.network import TrainingNetwork, TrainingPair, total_loss
 from utopic_cli.training.optimisation import learning_rate, step
-from utopic_cli.training.pace import Limits, Meter, caught_signals
+from utopic_cli.training.pace import InterruptedRun, Limits, Meter, caught_signals
 from utopic_cli.training.processes import Processes, joined_processes
 from utopic_cli.training.run import Run, export, start_run, total_pairs
 from utopic_cli.training.validation import PeriodicValidation, validation_pairs
@@ -76,6 +76,7 @@ def train(
         InputError: nothing to resume, other settings than the checkpoint's, or a batch that
             can't be shared among the processes.
         DivergedError: the loss became NaN or infinite.
+        InterruptedRun: Ctrl-C; saved and exported all the same.
         OutputError: the folder can't be written.
     """
     device = device or torch.device("cpu")
@@ -105,7 +106,7 @@ def train(
             }
             export(run.average.network(run.network.inference), card, out)
         if signal.SIGINT in received:
-            raise KeyboardInterrupt  # saved, but not what was asked for in the first place
+            raise InterruptedRun(path)  # saved, but not what was asked for in the first place
         return path
 
 

@@ -1,0 +1,103 @@
+"""Scans as a caller gives them, files or arrays, and a result in their own numbering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from utopic_cli.errors import InputError
+from utopic_cli.io.records import FormatError
+from utopic_cli.io.scan import check_points, read_scan
+from utopic_cli.point_cloud import PointCloud
+from utopic_cli.result import RegistrationResult
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+
+@dataclass(frozen=True)
+class Given:
+    """A scan.
+
+    Attributes:
+        cloud: its finite points.
+        kept: (N,) int64, the row or record each of them came from.
+        records: how many there were.
+        warnings: what the caller should know.
+    """
+
+    cloud: PointCloud
+    kept: np.ndarray
+    records: int
+    warnings: tuple[str, ...]
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the points as one for each record; NaN where its point was left out."""
+        if len(values) == self.records:
+            return values
+        whole = np.full(self.records, np.nan, values.dtype)
+        whole[self.kept] = values
+        return whole
+
+
+def take(scan: str | PathLike[str] | ArrayLike, name: str, seed: int) -> Given:
+    """Read a file, or check an array (N, 3) as a file's points are.
+
+    Args:
+        scan: a path, or real numbers; rows that are not finite are left out.
+        name: what to call it in an error.
+        seed: of the points drawn from a mesh file.
+
+    Raises:
+        InputError: it can't be used.
+    """
+    if isinstance(scan, (str, PathLike)):
+        read = read_scan(scan, seed=seed)
+        return Given(read.cloud, read.kept, read.records, tuple(f"{name}: {said}" for said in read.warnings))
+    points = _numbers(scan, name)
+    kept = np.flatnonzero(np.isfinite(points).all(axis=1))
+    dropped = len(points) - len(kept)
+    finite = points[kept] if dropped else points
+    try:
+        check_points(finite, len(points))
+    except FormatError as error:
+        raise InputError(f"{name}: {error}") from error
+    said = (f"{name}: {dropped} of {len(points)} points are NaN or infinite and were left out",)
+    return Given(PointCloud(finite), kept, len(points), said if dropped else ())
+
+
+def as_given(result: RegistrationResult, source: Given, target: Given) -> RegistrationResult:
+    """Return a result whose arrays and indices are those of the scans as they were given."""
+    pairs = result.correspondences
+    return replace(
+        result,
+        source_overlap=source.spread(result.source_overlap),
+        target_overlap=target.spread(result.target_overlap),
+        source_uncertainty=source.spread(result.source_uncertainty),
+        target_uncertainty=target.spread(result.target_uncertainty),
+        correspondences=replace(
+            pairs,
+            source_indices=source.kept[pairs.source_indices],
+            target_indices=target.kept[pairs.target_indices],
+        ),
+        warnings=(*result.warnings, *source.warnings, *target.warnings),
+    )
+
+
+def _numbers(scan: Any, name: str) -> np.ndarray:
+    """Return real numbers (N, 3) as float64."""
+    try:
+        given = np.asarray(scan)
+        points = given.astype(np.float64) if given.dtype.kind in "fiub" else None
+    except (TypeError, ValueError):
+        points = None
+    if points is None:
+        raise InputError(
+            f"{name}: a {type(scan).__name__} that is neither a path nor an (N, 3) array of real numbers"
+        )
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name}: an array of shape {points.shape}; expected (N, 3)")
+    return points
