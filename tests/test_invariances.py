@@ -13,10 +13,12 @@ import json
 import os
 import subprocess
 import sys
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from typer.testing import CliRunner
 
 from utopic_cli.cli import app
@@ -217,6 +219,11 @@ def test_the_same_seed_gives_the_same_bytes(files: list[Path], tmp_path: Path, t
         assert [name for name in first if again[name] != first[name]] == []
 
 
+def columns_of(ply: bytes) -> dict[str, np.ndarray]:
+    vertices = trimesh.load(BytesIO(ply), file_type="ply", process=False).metadata["_ply_raw"]["vertex"]
+    return {name: vertices["data"][name] for name in vertices["properties"]}
+
+
 def test_attributes_of_the_points_change_nothing(pair: ScanPair, files: list[Path], tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     dressed = []
@@ -231,7 +238,15 @@ def test_attributes_of_the_points_change_nothing(pair: ScanPair, files: list[Pat
     plain, rich = align_here(files, tmp_path / "plain"), align_here(dressed, tmp_path / "rich")
     assert rich.keys() == plain.keys()
     changed = {name for name in plain if rich[name] != plain[name]}
-    assert changed == {"aligned.ply", "report.json"}  # the one keeps the attributes, the other the hash
+    clouds = {f"{side}_{field}.ply" for side in ("source", "target") for field in ("overlap", "uncertainty")}
+    # The clouds and the aligned scan keep the attributes, the report the hash.
+    assert changed == {"aligned.ply", "report.json"} | clouds
+    for name in clouds:
+        without, with_them = (columns_of(out[name]) for out in (plain, rich))
+        assert set(with_them) > set(without) > {"x", "y", "z", "red", "quality"}
+        for column, values in without.items():
+            if not column.startswith("original_"):  # colours are attributes, too
+                np.testing.assert_array_equal(with_them[column], values, err_msg=column)
     reports = [json.loads(out["report.json"]) for out in (plain, rich)]
     for report in reports:
         for side in ("source", "target"):

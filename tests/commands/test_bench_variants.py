@@ -46,7 +46,7 @@ surface_points = [150, 150]
 """
 
 
-RECORD = {"of": 4, "stage": "joint", "elapsed_s": 2.0, "left_s": 0.0}
+RECORD = {"of": 4, "stage": "joint", "elapsed_s": 2.0, "left_s": 0.0, "pairs_per_s": 2.0}
 REAL_TRAIN = trainer.train
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -122,7 +123,9 @@ def test_a_cluster_that_loses_a_worker_midway_gives_what_one_machine_gives(dask,
     assert failed == {"crash--s0.json", "hang--s1.json"}
     assert theirs == ours
     assert (tmp_path / "there" / "poses.json").read_bytes() == (tmp_path / "here" / "poses.json").read_bytes()
-    assert 12 <= len(log.read_text().split()) <= 13  # the pair that was at work there, once more
+    tried = Counter(log.read_text().split())
+    # Once more: the pair that was at work there, and one that was done but not yet handed over.
+    assert len(tried) == 12 and max(tried.values()) <= 2 and tried.total() <= 14
 
 
 def test_a_scheduler_that_is_not_there_is_said_soon(tmp_path, monkeypatch):
