@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from utopic_cli.model.threads import one_thread
 
+
+@one_thread()
 def sinkhorn(affinity: Tensor, iterations: int) -> Tensor:
     """Turn affinities into a soft correspondence matrix with a slack row and column.
 
@@ -32,6 +35,7 @@ def sinkhorn(affinity: Tensor, iterations: int) -> Tensor:
     return torch.cat([scores, torch.cat([column_scale, corner], dim=1).transpose(1, 2)], dim=1)
 
 
+@one_thread()
 def _instance_norm(matrix: Tensor, real: Tensor | None) -> Tensor:
     """Zero mean and unit variance over each (N, M) map of a batch, over its real entries if given."""
     if real is None:

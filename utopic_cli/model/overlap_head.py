@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from utopic_cli.model.threads import one_thread
+
 
 class OverlapHead(nn.Module):
     """A linear layer on the final features; matched mass and the first estimate are further witnesses."""
@@ -16,6 +18,7 @@ class OverlapHead(nn.Module):
         self.mass_gain = nn.Parameter(torch.tensor(0.5))
         self.mean_gain = nn.Parameter(torch.tensor(1.0))
 
+    @one_thread()
     def forward(self, features: Tensor, slack: Tensor, mean: Tensor) -> Tensor:
         """Return overlap logits.
 

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from utopic_cli.model.threads import one_thread
+
 
 class OverlapDistribution(NamedTuple):
     """The learned distribution of each point's overlap and samples of it.
@@ -45,6 +47,7 @@ class UncertaintyQuantification(nn.Module):
             self.evidence = nn.Linear(evidence, 2, bias=False)
             nn.init.zeros_(self.evidence.weight)
 
+    @one_thread()
     def forward(
         self, features: Tensor, generator: torch.Generator, evidence: Tensor | None = None
     ) -> OverlapDistribution:
@@ -117,7 +120,9 @@ class UncertaintyWeighting(nn.Module):
         Returns:
             (B, N, V): MLP(cat[F, C F_other]) * (1 - U), masked points zeroed.
         """
-        fused = self.mlp(torch.cat([features, scores.to(other.dtype) @ other], dim=-1))
+        with one_thread():
+            partner = scores.to(other.dtype) @ other  # (B, N, V)
+        fused = self.mlp(torch.cat([features, partner], dim=-1))
         if uncertainty is not None:
             fused = fused * (1.0 - uncertainty[..., None])
         if keep is not None:
