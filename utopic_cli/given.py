@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from utopic_cli.errors import InputError
-from utopic_cli.io.records import FormatError
-from utopic_cli.io.scan import check_points, read_scan
+from utopic_cli.errors import InputError, UsageError
+from utopic_cli.io.ply_writer import points_ply
+from utopic_cli.io.records import Document, FormatError, Motion
+from utopic_cli.io.scan import Scan, check_points, parse_scan, read_scan
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import RegistrationResult
 
@@ -85,6 +87,61 @@ def as_given(result: RegistrationResult, source: Given, target: Given) -> Regist
         ),
         warnings=(*result.warnings, *source.warnings, *target.warnings),
     )
+
+
+def scan_of(scan: str | PathLike[str] | ArrayLike, name: str, seed: int) -> Scan:
+    """Return a file, or an array (N, 3) as the file of its points, with what is needed to write it moved.
+
+    Args:
+        scan: a path, or real numbers.
+        name: what to call an array: ``source`` makes it ``source.ply``.
+        seed: of the points drawn from a mesh file.
+
+    Raises:
+        InputError: it can't be used.
+    """
+    if isinstance(scan, (str, PathLike)):
+        return read_scan(scan, seed=seed)
+    made = parse_scan(Path(f"{name}.ply"), points_ply(_numbers(scan, name)))
+    return replace(made, document=replace(made.document, document=_Array(made.document.document)))
+
+
+@dataclass(frozen=True)
+class _Array:
+    """An array as a document: a PLY that lies nowhere."""
+
+    made: Document
+
+    def rewrite(self, motion: Motion) -> bytes:
+        return self.made.rewrite(motion)
+
+    def fields(self, records: int) -> dict[str, np.ndarray]:
+        """Its points are all there is to it."""
+        return {}
+
+
+def as_read(result: RegistrationResult, source: Scan, target: Scan) -> RegistrationResult:
+    """Return a result of ``as_given`` whose arrays and indices are those of the scans' points again.
+
+    Raises:
+        UsageError: the scans have other numbers of points than those that were aligned.
+    """
+    changes: dict[str, Any] = {}
+    pairs = result.correspondences
+    said: set[str] = set()
+    for name, scan in (("source", source), ("target", target)):
+        values = [getattr(result, f"{name}_{field}") for field in ("overlap", "uncertainty")]
+        if len(values[0]) != scan.records:
+            raise UsageError(
+                f"{scan.path}: has {scan.records} points, the result's {name} {len(values[0])};"
+                " give the scans that were aligned, source first"
+            )
+        changes |= {f"{name}_overlap": values[0][scan.kept], f"{name}_uncertainty": values[1][scan.kept]}
+        place = np.searchsorted(scan.kept, getattr(pairs, f"{name}_indices"))
+        pairs = replace(pairs, **{f"{name}_indices": place})
+        said |= {f"{name}: {warning}" for warning in scan.warnings}
+    kept = tuple(warning for warning in result.warnings if warning not in said)
+    return replace(result, **changes, correspondences=pairs, warnings=kept)
 
 
 def _numbers(scan: Any, name: str) -> np.ndarray:

@@ -15,10 +15,10 @@ from utopic_cli.clock import Clock, Progress
 from utopic_cli.config import SOLVERS, AlignOptions, OptionValues
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.evidence import SAME, Seen, collect_evidence
-from utopic_cli.estimation.observability import observe
+from utopic_cli.estimation.observability import Twists, find_twists, observe
 from utopic_cli.estimation.problem import working_voxel
 from utopic_cli.estimation.refinement import refine
-from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
+from utopic_cli.estimation.surface import make_surface, point_spacing
 from utopic_cli.estimation.verification import measure_fit
 from utopic_cli.frame import find_frame, size_ratio
 from utopic_cli.geometry import rigid
@@ -160,9 +160,10 @@ def _register(
     fit = measure_fit(source, target, transformation, threshold, estimate.support, trees=trees)
     voxel = working_voxel(prepared.source.dense, prepared.target.dense, prepared.spacing)
     surfaces = make_surface(prepared.source.dense, voxel), make_surface(prepared.target.dense, voxel)
-    observability = _observe(prepared, *surfaces, normalised)
+    twists = find_twists(*surfaces, normalised)
+    observability = None if twists is None else _observe(prepared, twists, voxel)
     signals = collect_evidence(
-        *surfaces, normalised, estimate, _seen(prepared, view), fit, observability, spread
+        *surfaces, normalised, estimate, _seen(prepared, view), fit, twists, spread
     ).as_dict()
     rivals = tuple(
         prepared.denormalise(rival.T_target_source)
@@ -249,14 +250,9 @@ def _as_motion(initial: ArrayLike) -> np.ndarray:
         ) from None
 
 
-def _observe(
-    prepared: PreparedPair, source: Surface, target: Surface, normalised: np.ndarray
-) -> Observability | None:
-    """Find which motions the overlap fixes, in file units; None if too little overlaps to tell."""
-    try:
-        seen = observe(source, target, normalised)
-    except ValueError:
-        return None
+def _observe(prepared: PreparedPair, twists: Twists, voxel: float) -> Observability:
+    """Find which motions the overlap fixes, in file units."""
+    seen = observe(twists, voxel)
     scale, centre = prepared.scale, prepared.target_centre
     units = np.concatenate([np.ones(3), np.full(3, scale)])
     free = tuple(

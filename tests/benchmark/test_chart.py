@@ -6,7 +6,8 @@ import pytest
 
 from utopic_cli.benchmark.chart import Chart, round_up
 from utopic_cli.benchmark.plots import LOOKS, recall_plot, value_plot
-from utopic_cli.benchmark.web import HERE, document
+from utopic_cli.benchmark.web import document
+from utopic_cli.page.skeleton import resource
 
 
 @pytest.mark.parametrize(
@@ -32,7 +33,7 @@ def test_lines_beyond_the_looks_are_left_to_the_tables() -> None:
     series = {f"method {place}": [(0.0, 1.0), (1.0, 2.0)] for place in range(LOOKS + 1)}
     drawn = value_plot("name", "caption", ("x", "y"), series, 1.0)
     assert drawn.count("<polyline") == LOOKS and f"method {LOOKS}" not in drawn
-    style = (HERE / "page.css").read_text()
+    style = resource("utopic_cli.benchmark", "page.css")
     assert all(f"svg .s{place}, .k{place}" in style for place in range(LOOKS))
     # Half of the pairs are off by 2 degrees, a quarter has no answer.
     drawn = recall_plot({"one": [2.0, 2.0, 30.0, None]})
@@ -41,8 +42,8 @@ def test_lines_beyond_the_looks_are_left_to_the_tables() -> None:
 
 @pytest.mark.parametrize("template", ["result_page.html", "trust_page.html"])
 def test_pages_share_one_head(template: str) -> None:
-    fills = dict.fromkeys(re.findall(r"{{(\w+)}}", (HERE / template).read_text()), "filled")
-    del fills["head"]
+    body = resource("utopic_cli.benchmark", template)
+    fills = dict.fromkeys(re.findall(r"{{(\w+)}}", body), "filled")
     page = document(template, fills)
     assert page.startswith("<!doctype html>") and "<title>filled</title>" in page
     assert "--paper" in page and "{{" not in page

@@ -25,9 +25,9 @@ from utopic_cli.benchmark.curves import (
 )
 from utopic_cli.benchmark.pair_metrics import PoseMeasures
 from utopic_cli.benchmark.protocols import CropProtocol
+from utopic_cli.benchmark.reports import render
 from utopic_cli.benchmark.result_page import page
 from utopic_cli.benchmark.synthetic import run
-from utopic_cli.benchmark.synthetic_report import render
 from utopic_cli.errors import UsageError
 from utopic_cli.geometry.rigid import apply, relative_rotation_error_deg
 from utopic_cli.synthesis.pairs import evaluation_pair

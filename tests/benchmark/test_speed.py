@@ -11,10 +11,11 @@ import pytest
 from rich.console import Console
 
 from utopic_cli.benchmark import speed
+from utopic_cli.benchmark.reports import render
 from utopic_cli.benchmark.result_page import page
 from utopic_cli.benchmark.speed import _memory_wanted, run
 from utopic_cli.benchmark.speed_clock import Stopwatch, available_memory, peak_memory
-from utopic_cli.benchmark.speed_report import ALIGN, FORWARD, Measurement, SpeedReport, render
+from utopic_cli.benchmark.speed_report import ALIGN, FORWARD, Measurement, SpeedReport
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.synthesis.procedural import procedural_mesh
 from utopic_cli.synthesis.shapes import ShapeLibrary, pack

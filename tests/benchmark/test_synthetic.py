@@ -14,10 +14,12 @@ from utopic_cli.benchmark.answers import FLOOR, REFINED, SOLVED, answer_pair
 from utopic_cli.benchmark.contestants import Contestants
 from utopic_cli.benchmark.curves import PARAMETERS, CurveProtocol, SweepProtocol
 from utopic_cli.benchmark.fpfh import Fpfh
+from utopic_cli.benchmark.held_out import held_out
 from utopic_cli.benchmark.method import Trial
 from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
+from utopic_cli.benchmark.reports import render
 from utopic_cli.benchmark.result_page import page
-from utopic_cli.benchmark.synthetic import Report, held_out, render, run
+from utopic_cli.benchmark.synthetic import Report, run
 from utopic_cli.bridge import NetworkView
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.geometry.rigid import apply, rigid

@@ -14,9 +14,10 @@ from tests.model.conftest import SMALL
 from utopic_cli.benchmark.pair_metrics import MatchMeasures, OverlapMeasures, PoseMeasures
 from utopic_cli.benchmark.paired import Difference
 from utopic_cli.benchmark.protocols import CropProtocol
+from utopic_cli.benchmark.reports import render
 from utopic_cli.benchmark.result_page import page
 from utopic_cli.benchmark.variant_pairs import PairResult, answer
-from utopic_cli.benchmark.variant_report import VariantReport, VariantRun, render
+from utopic_cli.benchmark.variant_report import VariantReport, VariantRun
 from utopic_cli.benchmark.variant_summary import told_apart
 from utopic_cli.benchmark.variants import CONTROL, FULL, TABLES, VARIANTS
 from utopic_cli.config import ModelConfig

@@ -121,6 +121,19 @@ def test_coloured_clouds_keep_what_the_scans_file_says(cli, fake, scans, tmp_pat
         np.testing.assert_array_equal(fields["scalar_intensity"], np.arange(60))
 
 
+def test_fields_that_can_not_be_kept_are_said_where_clouds_are_asked_for(cli, fake, scans, tmp_path):
+    """A layout that only the reader of points knows: vertices behind another element."""
+    text = scans[0].read_text().replace("element vertex", "element note 1\nproperty int n\nelement vertex")
+    scans[0].write_text(text.replace("end_header\n", "end_header\n7\n"))
+    lost = f"{scans[0]}: its colours and scalar fields are not in the coloured clouds: its PLY vertices don't"
+    result = cli("align", *scans, "--out-dir", tmp_path / "out")
+    assert result.exit_code == 0 and result.stderr.count(f"utopic: warning: {lost} come first") == 1
+    assert [lost in text for text in json.loads((tmp_path / "out" / "report.json").read_text())["warnings"]]
+    assert lost.split(": ")[1] in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert b"scalar_red" not in (tmp_path / "out" / "source_overlap.ply").read_bytes()
+    assert "warning" not in cli("align", *scans, "-o", tmp_path / "T.txt").stderr
+
+
 def test_the_colour_map_is_that_of_clouds_and_page(cli, fake, scans, tmp_path):
     out = tmp_path / "out"
     assert cli("align", *scans, "--out-dir", out, "--colormap", "purple-yellow").exit_code == 0

@@ -15,6 +15,7 @@ from utopic_cli.io.scan import read_scan
 from utopic_cli.io.transformation import FORM_OF_SUFFIX, FORMS, format_transformation, read_transformation
 
 QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+IN_FOLDER = Path("folder", "in.ply")
 SHIFT = np.array([[1.0, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
@@ -91,6 +92,7 @@ def test_nothing_is_replaced_unasked(cli, files: Path) -> None:
     [
         (["in.ply", "-o", "out.ply"], 2, "give a transformation and a scan"),
         (["quarter.txt", "in.ply", "-o", "out.pcd"], 2, ".ply"),
+        (["quarter.txt", "in.ply", "-o", "folder"], 2, f"is a folder; name a file in it: -o {IN_FOLDER}"),
         (["shift.json", "quarter.txt", "-o", "out.txt"], 2, "'utopic transformation'"),
         (["missing.txt", "in.ply", "-o", "out.ply"], 4, "no such file"),
         (["quarter.txt", "missing.ply", "-o", "out.ply"], 4, "no such file"),
@@ -105,6 +107,7 @@ def test_refusals_are_one_line(
 ) -> None:
     monkeypatch.chdir(files)
     (files / "mirror.txt").write_bytes(format_transformation(np.diag([1.0, 1, -1, 1]), "matrix"))
+    (files / "folder").mkdir()
     before = set(files.iterdir())
     result = cli("apply", *arguments)
     assert result.exit_code == code, result.stderr
@@ -129,6 +132,15 @@ def test_without_an_output_it_goes_to_stdout(cli, files: Path) -> None:
     assert stage == {"type": "filters.transformation", "matrix": "0 -1 0 1 1 0 0 2 0 0 1 3 0 0 0 1"}
     assert cli("transformation", files / "quarter.txt", "--form", "npy").exit_code == 2
     assert cli("transformation", files / "quarter.txt", "-o", files / "T.xyz").exit_code == 2
+
+
+@pytest.mark.parametrize("more", [[], ["--form", "tum"], ["--overwrite"]])
+def test_a_folder_in_the_place_of_a_file_is_told(cli, files: Path, more: list[str]) -> None:
+    for folder in (files, files / "named.txt"):
+        folder.mkdir(exist_ok=True)
+        result = cli("transformation", files / "quarter.txt", "-o", folder, *more)
+        assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+        assert f"{folder}: is a folder; name a file in it: -o {folder / 'T.txt'}" in result.stderr
 
 
 def test_the_forms_offered_are_the_forms_there_are() -> None:

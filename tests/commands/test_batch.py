@@ -27,9 +27,9 @@ def stubbed(monkeypatch):
     run = room.run_batch
     seen = []
 
-    def run_stubbed(asked, progress=None):
+    def run_stubbed(asked, **told):
         seen.append(asked)
-        return run(asked, progress=progress, make_task=make_stub)
+        return run(asked, **told, make_task=make_stub)
 
     monkeypatch.setattr(room, "weights_of", lambda options: {"name": "stub", "sha256": "stub"})
     monkeypatch.setattr(room, "run_batch", run_stubbed)
@@ -176,8 +176,8 @@ from tests.multiway.stubs import make_stub
 from utopic_cli.multiway import batch as room
 run = room.run_batch
 room.weights_of = lambda options: {"name": "stub", "sha256": "stub"}
-room.run_batch = lambda asked, progress=None: run(
-    asked, progress=progress, make_task=partial(make_stub, "", True, float(os.environ["PAUSE"]))
+room.run_batch = lambda asked, **told: run(
+    asked, **told, make_task=partial(make_stub, "", True, float(os.environ["PAUSE"]))
 )
 from utopic_cli.cli import main
 if __name__ == "__main__":
@@ -270,3 +270,56 @@ def test_a_dry_run_says_what_an_earlier_batch_left(cli, stubbed, tmp_path):
     assert "1 of its pairs recorded; pass --resume to go on with it or --overwrite" in result.stdout
     assert "used again" in cli(*asked, "--resume").stdout
     assert "replaced" in cli(*asked, "--overwrite").stdout
+
+
+def test_files_that_are_no_scans_or_broken_are_said_at_the_start(cli, stubbed, tmp_path):
+    """In a dry run as well; broken ones are left out with exit code 6, the others cost nothing."""
+    scans = tmp_path / "scans"
+    write_scans(scans, ["a.ply", "b.ply"])
+    (scans / "README.txt").write_text("Scans of a thing.\n")
+    asked = ["batch", scans, "--out-dir", tmp_path / "out"]
+    line = "2 files are no scans and left out: text without points: 1 (README.txt); no scan format: 1"
+    dry = cli(*asked, "--dry-run")
+    assert [text.split()[0] for text in dry.stdout.splitlines()] == ["scan", "scan", "note", "pair", "1"]
+    assert line in dry.stdout
+    done = cli(*asked)
+    assert done.exit_code == 0 and done.stderr.count("no scans and left out") == 1
+    (scans / "cut.ply").write_bytes((scans / "a.ply").read_bytes()[:-5])
+    (scans / "odd.txt").write_text("1,5 2,5 3,5\n" * 60)
+    dry = cli(*asked, "--dry-run")
+    told = [text for text in dry.stdout.splitlines() if text.startswith(("left out", "no scan"))]
+    assert told[0].startswith(f"left out  {scans / 'cut.ply'}: its PLY header promises 200 vertex")
+    assert told[1].startswith(f"no scan  {scans / 'odd.txt'}: has '1,5', a decimal comma")
+    assert "1 pairs of 2 scans" in dry.stdout
+    done = cli(*asked, "--overwrite")
+    assert done.exit_code == 6
+    said = done.stderr.splitlines()
+    warned = [i for i, text in enumerate(said) if "warning" in text and "cut.ply: its PLY header" in text]
+    (placed,) = (i for i, text in enumerate(said) if "2 of 3 scans placed" in text)
+    assert warned and warned[0] < placed
+    assert any("left out cut: " in text for text in said[placed:])
+
+
+def test_what_we_made_is_no_scan(cli, fake, tmp_path) -> None:
+    """The whole set of an alignment, and a merged model, beside the scans."""
+    from utopic_cli.multiway.merge import write_merged
+    from utopic_cli.multiway.scans import find_scans
+
+    scans = tmp_path / "scans"
+    write_scans(scans, ["a.ply", "b.ply"])
+    (scans / "truth.json").unlink()
+    done = cli("align", scans / "a.ply", scans / "b.ply", "--out-dir", scans, "-q")
+    assert done.exit_code == 0, done.stderr
+    files = dict(enumerate(find_scans([scans]).scans))
+    for name in ("merged.ply", "merged-2.ply"):
+        write_merged(scans / name, {0: np.eye(4), 1: np.eye(4)}, files, seed=0)
+    told = {one.path.name: one.reason for one in find_scans([scans]).aside}
+    assert told.pop("transformation.txt") == "poses, not points"
+    assert {told.pop("report.html"), told.pop("report.json")} == {"no scan format"}
+    made = ["aligned.ply", "merged-2.ply", "merged.ply"]
+    made += [f"{side}_{field}.ply" for side in ("source", "target") for field in ("overlap", "uncertainty")]
+    assert told == dict.fromkeys(sorted(made), "made by utopic")
+    assert [scan.name for scan in find_scans([scans]).scans] == ["a", "b"]
+    assert {one.path.name for one in find_scans([scans / "*.ply"]).aside} == set(told)
+    named = find_scans([scans / "merged.ply", scans / "aligned.ply"])  # who names them wants them
+    assert not named.aside and len(named.scans) == 2

@@ -18,7 +18,7 @@ from utopic_cli.estimation.evidence import (
     collect_evidence,
 )
 from utopic_cli.estimation.meeting import MOST_ALIKE, meet
-from utopic_cli.estimation.observability import observe
+from utopic_cli.estimation.observability import find_twists
 from utopic_cli.estimation.solver import Estimate, solve
 from utopic_cli.estimation.surface import Surface, make_surface
 from utopic_cli.estimation.verification import measure_fit
@@ -100,7 +100,7 @@ def evidence_of(problem, scans: Scans, estimate: Estimate) -> Evidence:  # type:
         np.full(len(problem.source_nodes) + len(problem.target_nodes), 0.02),
     )
     fit = measure_fit(*scans, T, 3 * VOXEL, estimate.support)
-    return collect_evidence(source, target, T, estimate, seen, fit, observe(source, target, T), SAME)
+    return collect_evidence(source, target, T, estimate, seen, fit, find_twists(source, target, T), SAME)
 
 
 def test_every_signal_of_a_right_answer_is_finite_and_good(answered: tuple[Estimate, Evidence]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import time
@@ -16,6 +17,7 @@ from utopic_cli.geometry.rigid import invert, random_rotation, rigid
 from utopic_cli.io.ply_writer import scalar_cloud_ply
 from utopic_cli.io.scan import read_scan
 from utopic_cli.multiway.tasks import DescribeJob, describe
+from utopic_cli.multiway.vocabulary import LENGTH
 
 
 def report(T_target_source, *, confidence=0.97, trusted=True, overlap=0.6, centre=(0.0, 0.0, 0.0)):
@@ -71,9 +73,10 @@ def make_stub(log: str = "", calibrated: bool = True, sleep: float = 0.0):
 def _stub(log, calibrated, sleep, job):
     if isinstance(job, DescribeJob):
         record = describe(read_scan(job.scan.path), AlignOptions(), False)
-        if job.descriptor:
+        if job.descriptors:
             truth = json.loads((job.scan.path.parent / "truth.json").read_text())[job.scan.path.name]
-            record["descriptor"] = [float(truth["object"]), *np.array(truth["world"])[:3, 3]]
+            looks = np.random.default_rng(truth["object"]).integers(-100, 100, (50, LENGTH), np.int8)
+            record["descriptors"] = base64.b64encode(looks.tobytes()).decode("ascii")
         return record
     source, target = job.source.path, job.target.path
     if log:

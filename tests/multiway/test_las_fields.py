@@ -56,7 +56,7 @@ def test_fields_behind_a_megabyte_of_records_are_kept(tmp_path: Path, suffix: st
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(data[:size] + more + data[size:])
     expected = np.asarray(again(path.read_bytes()).intensity)
-    np.testing.assert_array_equal(kept_fields(read_scan(path))["intensity"], expected)
+    np.testing.assert_array_equal(kept_fields(read_scan(path))[0]["intensity"], expected)
     (tmp_path / f"b.{suffix}").write_bytes(data[:size] + more + data[size:] + b"\0")
     files = dict(enumerate(find_scans([path, tmp_path / f"b.{suffix}"]).scans))
     write_merged(tmp_path / "m.ply", dict.fromkeys(files, np.eye(4)), files, seed=0)
@@ -75,6 +75,6 @@ def test_no_more_is_asked_for_than_a_file_has() -> None:
 def test_coloured_clouds_keep_them(tmp_path: Path) -> None:
     path = tmp_path / "a.laz"
     path.write_bytes(las(compressed=True))
-    kept = kept_fields(read_scan(path))
+    kept, _ = kept_fields(read_scan(path))
     np.testing.assert_array_equal(kept["intensity"], np.asarray(again(path.read_bytes()).intensity))
     assert kept.keys() >= {"original_red", "original_green", "original_blue", "quality"}

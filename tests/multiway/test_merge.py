@@ -9,7 +9,7 @@ from utopic_cli.geometry.rigid import apply
 from utopic_cli.io import lzf
 from utopic_cli.io.ply_header import parse_header
 from utopic_cli.io.scan import read_scan
-from utopic_cli.multiway.merge import write_merged
+from utopic_cli.multiway.merge import fields_lost, write_merged
 from utopic_cli.multiway.scans import find_scans
 
 
@@ -222,3 +222,14 @@ def test_names_that_become_one_property_are_told_apart(tmp_path):
     table = merged(tmp_path / "s", xyz=text, xyz_=text + "\n")
     assert table.dtype.names[7:] == ("scalar_in_x", "scalar_in_x_")
     assert (table["scalar_in_x"] + table["scalar_in_x_"] == 0).all()
+
+
+def test_files_whose_fields_can_not_be_kept_are_named(tmp_path):
+    files, _ = make(tmp_path)
+    assert fields_lost(files.values()) == ()
+    data = files[1].path.read_bytes().replace(b"uchar blue", b"list uchar uchar blue", 1)
+    files[1].path.write_bytes(data)
+    (said,) = fields_lost(files.values())
+    assert said.startswith(f"{files[1].path}: ") and said.endswith(
+        "merged cloud: its PLY vertices hold lists"
+    )

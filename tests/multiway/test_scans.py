@@ -18,7 +18,8 @@ def test_a_folder_gives_its_scans_in_natural_order(tmp_path):
     write_scans(tmp_path / "deeper", ["scan3.ply"])
     found = find_scans([tmp_path])
     assert [scan.name for scan in found.scans] == ["scan1", "scan2", "scan10"]
-    assert not found.notes
+    (note,) = found.notes
+    assert note.endswith("2 files are no scans and left out: no scan format: 2 (notes.md, truth.json)")
     assert all(len(scan.sha256) == 64 for scan in found.scans)
 
 
@@ -50,9 +51,11 @@ def test_too_few_files_or_no_such_input(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no FIFOs here")
 def test_a_pipe_never_blocks_and_is_a_problem_of_its_own(tmp_path):
     write_scans(tmp_path, ["a.ply", "b.ply"])
-    os.mkfifo(tmp_path / "c.ply")
+    for name in ("c.ply", "d.txt"):
+        os.mkfifo(tmp_path / name)
     found = find_scans([tmp_path])
-    assert [bool(scan.problem) for scan in found.scans] == [False, False, True]
+    assert [bool(scan.problem) for scan in found.scans] == [False, False, True, True]
+    assert not any(scan.doubtful for scan in found.scans)
 
 
 def test_names_are_distinct_and_plain():

@@ -10,8 +10,8 @@ from functools import partial
 import pytest
 
 from utopic_cli.errors import InputError
-from utopic_cli.multiway import workers
 from utopic_cli.multiway.workers import Workers
+from utopic_cli.threads import threads_of_children
 
 
 def work(job):
@@ -92,7 +92,7 @@ def test_threads_that_start_processes_at_once_leave_the_environment_as_it_was(mo
     seen = []
 
     def start():
-        with workers._thread_variables(1):
+        with threads_of_children(1):
             seen.append(os.environ["OMP_NUM_THREADS"])
             with suppress(threading.BrokenBarrierError):  # two at once would meet here
                 inside.wait()

@@ -16,6 +16,14 @@ def library() -> ShapeLibrary:
     return pack(meshes, list("abcdef"), ["train"] * 4 + ["val"] * 2, ["one"] * 5 + ["two"])
 
 
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """Where packed shapes are kept meanwhile."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "utopic"
+
+
 def ball(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0), rings: int = 40):
     """A closed triangulated sphere."""
     height = np.linspace(0, np.pi, rings)

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from datetime import datetime, timezone
 from html.parser import HTMLParser
 
 import pytest
@@ -65,6 +66,14 @@ def test_last_first_and_best_values_are_in_the_table():
     assert ["descriptor", "4.125", "5.5", "", ""] in rows
     assert ["pairs/s", "2.5", "2.5", "", ""] in rows
     assert ["schedule.batch", str(SETTINGS["schedule"]["batch"])] in rows
+
+
+def test_the_time_left_is_said_as_of_when_and_only_while_there_is_some():
+    records = [record(2, left_s=1320.0)]
+    now = datetime(2024, 5, 3, 14, 7, 31, tzinfo=timezone.utc)
+    assert "about 22 min left as of 2024-05-03 14:07+00:00<" in curves_page(records, "run", {}, now=now)
+    ended = curves_page(records, "run", {})
+    assert "20 of 200,000 pairs in 1 min" in ended and "min left" not in ended
 
 
 def test_curves_hold_the_records_numbers_by_pairs_and_minutes():

@@ -40,6 +40,13 @@ def test_every_record_is_on_disk_at_once(tmp_path):
         assert lines(tmp_path) == [record(2), record(4)] == journal.records
 
 
+def test_an_ended_run_has_no_time_left(tmp_path):
+    with Journal(tmp_path, 0) as journal:
+        journal.write(record(2, left_s=600.0))
+        assert "about 10 min left as of 20" in (tmp_path / "curves.html").read_text()
+    assert "min left" not in (tmp_path / "curves.html").read_text()
+
+
 def test_resuming_keeps_what_the_checkpoint_knows_and_drops_the_rest(tmp_path):
     with Journal(tmp_path, 0) as journal:
         for pairs in (2, 4, 6):
@@ -112,7 +119,7 @@ def test_the_page_is_written_once_a_minute_and_at_the_end(tmp_path, monkeypatch)
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     pages = []
-    monkeypatch.setattr(module, "curves_page", lambda records, *_: pages.append(len(records)) or "page")
+    monkeypatch.setattr(module, "curves_page", lambda records, *_, **__: pages.append(len(records)) or "page")
     with Journal(tmp_path, 0) as journal:
         for seconds in (1, 20, 59, 62, 80, 121, 123):
             now[0] = seconds

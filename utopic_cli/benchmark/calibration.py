@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from utopic_cli.benchmark.held_out import made_of
 from utopic_cli.benchmark.pool import each
 from utopic_cli.benchmark.reliability import (
     accepted_at,
@@ -22,7 +23,6 @@ from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.confidence import Calibration, fit_calibration
 from utopic_cli.pipeline import register
-from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.verdict import ruled_out
 
@@ -168,10 +168,8 @@ def outcome_of(
     Raises:
         InputError: no such trial can be made of the shapes.
     """
-    try:
+    with made_of(data):
         made = trial(shapes, seed, number)
-    except DegeneratePair as error:
-        raise InputError(f"{data}: {error}; give more or other shapes") from error
     try:
         result = register(made.source, made.target, options)
     except InputError:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from utopic_cli.benchmark.answers import FLOOR, REFINED, Answer
 from utopic_cli.benchmark.pair_metrics import SUCCESS
-from utopic_cli.benchmark.synthetic_report import Report, make_table, share_cell, who
+from utopic_cli.benchmark.reports import add_groups, make_table, number, share_cell
+from utopic_cli.benchmark.synthetic_report import Report, who
 from utopic_cli.benchmark.synthetic_summary import Summary, summarise
-from utopic_cli.benchmark.trust_report import number
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -89,6 +89,7 @@ def _by_level(report: CurveReport) -> Table:
         f"({protocol['length_unit']}), translations compared {protocol['translation_error']}; or symmetric: "
         "or the object lies within 2 % of its extent of its place; medians of all answers; "
         "[95 % Wilson interval]",
+        ("level", "method"),
         (
             "pairs",
             "mean\noverlap",
@@ -100,14 +101,10 @@ def _by_level(report: CurveReport) -> Table:
             "no answer",
             "CPU, s",
         ),
-        first="level",
     )
-    previous = ""
-    for (group, method, stage), row in report.summaries().items():
-        if group != previous and previous:
-            table.add_section()
-        table.add_row(
-            group if group != previous else "",
+    rows = (
+        (
+            group,
             who(method, stage),
             str(row.pairs),
             f"{row.overlap:.2f}",
@@ -119,7 +116,9 @@ def _by_level(report: CurveReport) -> Table:
             str(row.without_answer),
             f"{sum(row.cpu_seconds.values()):.2f}",
         )
-        previous = group
+        for (group, method, stage), row in report.summaries().items()
+    )
+    add_groups(table, rows)
     return table
 
 
@@ -127,8 +126,8 @@ def _by_overlap(answers: Sequence[Answer]) -> Table:
     table = make_table(
         "By the overlap of each pair",
         f"steps of {OVERLAP_STEP:g}, whatever number of points was kept",
+        ("mean\noverlap", "method"),
         ("pairs", "success", "or symmetric", "Error(R)\nmedian, deg", "Error(t)\nmedian"),
-        first="mean\noverlap",
     )
     for (method, stage), rows in by_overlap(answers).items():
         if stage != REFINED:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from utopic_cli.benchmark.method import IDENTITY, LOCAL_REACH, NOTHING_NEAR, Trial
-from utopic_cli.errors import UsageError
+from utopic_cli.errors import optional_part
 from utopic_cli.geometry.rigid import rigid
 
 
@@ -98,10 +98,6 @@ def load_small_gicp() -> Any:
     Raises:
         UsageError: it can't be loaded; says why and the command that installs it.
     """
-    try:
+    with optional_part("the baseline small-gicp needs small_gicp", "small-gicp"):
         import small_gicp
-    except (ImportError, OSError) as error:
-        raise UsageError(
-            f"the baseline small-gicp needs small_gicp ({error}); install it: pip install small-gicp"
-        ) from error
     return small_gicp

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from utopic_cli.benchmark.method import Trial
-from utopic_cli.errors import UsageError
+from utopic_cli.errors import UsageError, optional_part
 from utopic_cli.geometry.rigid import rigid
 
 Answer = tuple[np.ndarray, np.ndarray]
@@ -93,12 +93,8 @@ def load_kiss_matcher() -> Any:
     Raises:
         UsageError: it can't be loaded; says why and the command that installs it.
     """
-    try:
+    with optional_part("the baseline kiss-matcher needs KISS-Matcher", "kiss-matcher"):
         import kiss_matcher
-    except (ImportError, OSError) as error:
-        raise UsageError(
-            f"the baseline kiss-matcher needs KISS-Matcher ({error}); install it: pip install kiss-matcher"
-        ) from error
     return kiss_matcher
 
 

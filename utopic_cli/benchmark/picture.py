@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.errors import InputError, UsageError, UtopicError
+from utopic_cli.errors import InputError, UtopicError, optional_part
 from utopic_cli.geometry.normals import estimate_normals, orient_normals
 from utopic_cli.geometry.rigid import apply
 from utopic_cli.geometry.voxel import voxel_downsample
@@ -183,11 +183,9 @@ def compose(drawn: Sequence[tuple[str, np.ndarray]], columns: int = 3) -> bytes:
     Raises:
         UsageError: matplotlib is not installed.
     """
-    try:
+    with optional_part("pictures need matplotlib", "matplotlib"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UsageError(f"pictures need matplotlib ({error}); install it: pip install matplotlib") from error
     rows = -(-len(drawn) // columns)
     side = drawn[0][1].shape[0] / 100.0
     figure = Figure(figsize=(columns * side, rows * (side + 0.3)), dpi=100, layout="constrained")

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from utopic_cli.benchmark.chart import Chart, round_up
+from utopic_cli.benchmark.reports import share
 from utopic_cli.benchmark.synthetic_summary import Share
-from utopic_cli.benchmark.trust_report import share
 from utopic_cli.benchmark.web import figure
 
 LOOKS = 8

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
-Result = TypeVar("Result")
+from utopic_cli.threads import threads_of_children
 
-# NumPy's and SciPy's linear algebra, torch and Open3D all heed one of these when they are loaded.
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+Result = TypeVar("Result")
 
 
 def each(
@@ -49,7 +47,7 @@ def each(
     pipes: list[Connection] = []
     try:
         context = multiprocessing.get_context("spawn")
-        with _one_thread():
+        with threads_of_children(1):
             for _ in range(min(workers, count)):
                 mine, theirs = context.Pipe()
                 # No daemon: those may not have processes of their own, which some methods need.
@@ -111,18 +109,3 @@ def _serve(pipe: Connection, make_task: Callable[[], Callable[[int], Any]]) -> N
         return
     except Exception as error:
         pipe.send((-1, None, error, traceback.format_exc()))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let processes started meanwhile use one thread for linear algebra."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -19,6 +19,7 @@ from utopic_cli.benchmark.metrics import (
     overlap_band,
     summarise,
 )
+from utopic_cli.benchmark.reports import make_table, number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -157,40 +158,24 @@ def render(report: Report, console: Console) -> None:
 
 
 def _by_band(report: Report) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(
-        title=escape(report.title),
-        caption=f"success: RRE < {MAX_RRE_DEG:g} deg and RTE < {MAX_RTE_SHARE:.0%} of the extent, "
+    table = make_table(
+        report.title,
+        f"success: RRE < {MAX_RRE_DEG:g} deg and RTE < {MAX_RTE_SHARE:.0%} of the extent, "
         "RTE at the source's centroid; overlap of the smaller side",
+        ("overlap", "method"),
+        ("success", "RRE of\nsuccesses, deg", "RRE of\nall, deg", "RTE of\nsuccesses", "time, s", "CPU, s"),
     )
-    table.add_column("overlap")
-    table.add_column("method")
-    for heading in (
-        "success",
-        "RRE of\nsuccesses, deg",
-        "RRE of\nall, deg",
-        "RTE of\nsuccesses",
-        "time, s",
-        "CPU, s",
-    ):
-        table.add_column(heading, justify="right")
     for band, methods in report.summaries().items():
         for place, (method, summary) in enumerate(methods.items()):
             table.add_row(
                 band if place == 0 else "",
                 method,
                 f"{summary.successes}/{summary.attempts} ({summary.success_rate:.0%})",
-                _number(summary.median_rre_deg_of_successes, "{:.3f}"),
-                _number(summary.median_rre_deg, "{:.2f}"),
-                _number(summary.median_rte_share_of_successes, "{:.3%}"),
+                number(summary.median_rre_deg_of_successes, "{:.3f}"),
+                number(summary.median_rre_deg, "{:.2f}"),
+                number(summary.median_rte_share_of_successes, "{:.3%}"),
                 f"{summary.mean_seconds:.2f}",
                 f"{summary.mean_cpu_seconds:.2f}",
             )
         table.add_section()
     return table
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)

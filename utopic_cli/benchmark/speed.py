@@ -21,22 +21,22 @@ import numpy as np
 
 from utopic_cli.benchmark.baselines import find_baselines
 from utopic_cli.benchmark.curves import BAND, CLEAN, SCAN_POINTS
+from utopic_cli.benchmark.held_out import held_out, made_of
 from utopic_cli.benchmark.method import Trial, checked, refined
 from utopic_cli.benchmark.metrics import pair_extent, pose_error
 from utopic_cli.benchmark.pool import each
 from utopic_cli.benchmark.speed_clock import Peak, Stopwatch, available_memory
 from utopic_cli.benchmark.speed_report import ALIGN, FORWARD, SCHEMA_VERSION, Measurement, SpeedReport
-from utopic_cli.benchmark.synthetic import held_out
 from utopic_cli.benchmark.versions import versions
 from utopic_cli.bridge import load_network, predict, to_cloud_input
 from utopic_cli.config import AlignOptions
-from utopic_cli.errors import InputError, UsageError
+from utopic_cli.errors import UsageError
 from utopic_cli.estimation.correspondences import linear_assignment
 from utopic_cli.model.cloud_input import stack_clouds
 from utopic_cli.pipeline import FEWEST_NODES, register
 from utopic_cli.preprocess import prepare
 from utopic_cli.synthesis.pairs import evaluation_pair
-from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair
+from utopic_cli.synthesis.scan_pair import ScanPair
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
 POINTS = (512, 717, 1024, 2048, 5000)
@@ -81,10 +81,8 @@ def run(
     devices = _devices(device)
     model, card = load_network(weights, devices[0])
     test, split = held_out(shapes)
-    try:
+    with made_of(data):
         made = [evaluation_pair(test, seed, number, (BAND,), CLEAN) for number in range(pairs)]
-    except DegeneratePair as error:
-        raise InputError(f"{data}: {error}; give more or other shapes") from error
     settings = {
         "schema_version": SCHEMA_VERSION,
         "protocol": {

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 from utopic_cli.benchmark.method import remarks
 from utopic_cli.benchmark.plots import value_plot
 from utopic_cli.benchmark.quoted import SECONDS, TIMED_ON
+from utopic_cli.benchmark.reports import make_table, number
 from utopic_cli.benchmark.speed_clock import Peak, Stopwatch
-from utopic_cli.benchmark.trust_report import number
 from utopic_cli.synthesis.packing import describe_data
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
 SCHEMA_VERSION = 1
@@ -153,19 +152,12 @@ class SpeedReport:
         return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def render(report: SpeedReport, console: Console) -> None:
-    """Print the tables, and why cases are missing where they are."""
-    for table in report.tables():
-        console.print(table)
-    for line in report.losses():
-        console.print(line, markup=False, highlight=False)
-
-
 def _forwards(report: SpeedReport) -> Table:
-    table = _table(
+    table = make_table(
         report.title,
         "the network alone, one CPU thread; medians over the pairs; peak of the process (of CUDA: what "
         "PyTorch held there), of which so much before the first run",
+        (),
         ("points", "batch", "device", "nodes", "wall, s", "CPU, s", "pairs/s", "peak, MB", "before, MB"),
     )
     for one in report.measurements:
@@ -187,13 +179,13 @@ def _forwards(report: SpeedReport) -> Table:
 def _alignments(report: SpeedReport) -> Table:
     from rich.markup import escape
 
-    table = _table(
+    table = make_table(
         "Whole alignments",
         "without reading and writing files; right: under 5 degrees and under 5 % of the extent; linear "
         "assignment: one, timed by itself, and its share of the whole; quoted: from the paper, on "
         "other pairs and another machine",
+        ("method",),
         (
-            "method",
             "points",
             "device",
             "wall, s",
@@ -227,16 +219,6 @@ def _alignments(report: SpeedReport) -> Table:
             TIMED_ON,
             " / ".join(f"{second:.2f}" for second in seconds.values()),
         )
-    return table
-
-
-def _table(title: str, caption: str, headings: tuple[str, ...]) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(title), caption=escape(caption))
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "method" else "right")
     return table
 
 

@@ -4,8 +4,8 @@ Definitions: ``protocols``, ``curves``. Everybody meets the same pairs in the sa
 networks and hand-made features go into the same robust solve; whole methods answer by themselves. Each
 answer is measured twice: as solved (no refinement), and after the same refinement at full resolution.
 
-For commands: ``report = run(protocol, shapes, ...)``, then ``render(report, console)`` prints the
-tables and ``report.to_json()`` is the text of the JSON file.
+For commands: ``report = run(protocol, shapes, ...)``, then ``reports.render(report, console)``
+prints the tables and ``report.to_json()`` is the text of the JSON file.
 """
 
 from __future__ import annotations
@@ -17,28 +17,16 @@ from typing import Any
 from utopic_cli.benchmark.answers import Answer, answer_pair
 from utopic_cli.benchmark.contestants import Contestants, load_contestants
 from utopic_cli.benchmark.curve_report import CurveReport
+from utopic_cli.benchmark.held_out import held_out, made_of
 from utopic_cli.benchmark.pool import each
 from utopic_cli.benchmark.protocols import AnyProtocol
-from utopic_cli.benchmark.synthetic_report import SCHEMA_VERSION, Report, render
+from utopic_cli.benchmark.synthetic_report import SCHEMA_VERSION, Report
 from utopic_cli.benchmark.versions import versions
 from utopic_cli.config import AlignOptions
-from utopic_cli.errors import InputError, UsageError
-from utopic_cli.synthesis.scan_pair import DegeneratePair
+from utopic_cli.errors import UsageError
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
-__all__ = ["Report", "held_out", "render", "run"]
-
 Progress = Callable[[int, int, str], None]
-
-
-def held_out(shapes: ShapeLibrary) -> tuple[ShapeLibrary, str]:
-    """Return the shapes that no training sees, and the name of their split.
-
-    Raises:
-        InputError: there are none.
-    """
-    split = "test" if "test" in shapes.splits else "val"
-    return shapes.select(split), split
 
 
 def run(
@@ -127,8 +115,6 @@ def answers_to(
     Raises:
         InputError: no such pair can be made of the shapes.
     """
-    try:
+    with made_of(data):
         pair = protocol.pair(shapes, seed, number)
-    except DegeneratePair as error:
-        raise InputError(f"{data}: {error}; give more or other shapes") from error
     return answer_pair(pair, number, protocol, contestants, points, seed)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from utopic_cli.benchmark.answers import FLOOR, REFINED, SOLVED, Answer
 from utopic_cli.benchmark.method import remarks
 from utopic_cli.benchmark.quoted import DATA, METRICS, OVERLAP_ACCURACY, QUOTED
-from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Share, Summary, summarise
+from utopic_cli.benchmark.reports import add_groups, json_by_rows, make_table, number, share_cell
+from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Summary, summarise
 from utopic_cli.benchmark.uncertainty import UncertaintySummary, summarise_uncertainty
 from utopic_cli.synthesis.packing import describe_data
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
 SCHEMA_VERSION = 1
@@ -115,9 +114,8 @@ class Report:
             "summary": rows,
             "uncertainty": uncertainty,
         }
-        head = json.dumps({**self.settings, **found}, indent=2, allow_nan=False)
-        lines = ",\n    ".join(json.dumps(answer.to_dict(), allow_nan=False) for answer in self.answers)
-        return f'{head[:-2]},\n  "answers": [\n    {lines}\n  ]\n}}\n'
+        answers = (answer.to_dict() for answer in self.answers)
+        return json_by_rows({**self.settings, **found}, "answers", answers)
 
     def _quoted(self) -> dict[str, dict[str, float]]:
         rows = QUOTED.get(self.settings["protocol"]["name"], {})
@@ -133,7 +131,7 @@ class Report:
     def quoted_rows(self) -> list[list[str]]:
         """Return the paper's figures as cells: name and six metrics."""
         return [
-            [f"{name} (quoted)", *(_number(row[key], _FORMS[key]) for key in METRICS)]
+            [f"{name} (quoted)", *(number(row[key], _FORMS[key]) for key in METRICS)]
             for name, row in self._quoted().items()
         ]
 
@@ -148,14 +146,6 @@ _FORMS = {
 }
 
 
-def render(report: Report, console: Console) -> None:
-    """Print the tables, and why answers are missing where they are."""
-    for table in report.tables():
-        console.print(table)
-    for line in report.losses():
-        console.print(line, markup=False, highlight=False)
-
-
 def _poses(report: Report) -> Table:
     protocol = report.settings["protocol"]
     floor = "; x floor: over the error of Procrustes on the true correspondences, no lower bound"
@@ -165,6 +155,7 @@ def _poses(report: Report) -> Table:
         f"recall: both errors are less; lengths in: {protocol['length_unit']}; translations compared "
         f"{protocol['translation_error']}; or symmetric: or the object lies within 2 % of its extent of its "
         f"place; [95 % Wilson interval]{floor if any(one.stage == FLOOR for one in report.answers) else ''}",
+        ("pairs", "method"),
         (
             "Error(R)\nmean, deg",
             "\nmedian",
@@ -178,25 +169,24 @@ def _poses(report: Report) -> Table:
             "CPU, s",
         ),
     )
-    previous = ""
-    for (group, method, stage), row in report.summaries().items():
-        if group != previous and previous:
-            table.add_section()
-        table.add_row(
-            group if group != previous else "",
+    rows = (
+        (
+            group,
             who(method, stage),
-            _number(row.error_r, "{:.3f}"),
-            _number(row.error_r_median, "{:.3f}"),
-            _number(row.error_t, "{:.4f}"),
+            number(row.error_r, "{:.3f}"),
+            number(row.error_r_median, "{:.3f}"),
+            number(row.error_t, "{:.4f}"),
             f"{row.fine.share:.1%}",
             f"{row.success.share:.1%}",
             share_cell(row.symmetric_success),
-            _number(row.floor_ratio_r, "{:.2f}"),
-            _number(row.floor_ratio_r_median, "{:.2f}"),
-            _number(row.floor_ratio_t, "{:.2f}"),
+            number(row.floor_ratio_r, "{:.2f}"),
+            number(row.floor_ratio_r_median, "{:.2f}"),
+            number(row.floor_ratio_t, "{:.2f}"),
             f"{sum(row.cpu_seconds.values()):.2f}",
         )
-        previous = group
+        for (group, method, stage), row in report.summaries().items()
+    )
+    add_groups(table, rows)
     return table
 
 
@@ -214,10 +204,11 @@ def _paper(report: Report) -> Table:
         "The paper's metrics",
         "quoted: from the paper, with shared points and its rotations, on other pairs than these; compare "
         "ratios to the statistical floor, not digits",
+        ("pairs", "method"),
         ("RMSE(R)", "MAE(R)", "RMSE(t)", "MAE(t)", "Error(R)", "Error(t)"),
     )
     for (group, method, stage), row in report.summaries().items():
-        cells = [_number(getattr(row, key), _FORMS[key]) for key in METRICS]
+        cells = [number(getattr(row, key), _FORMS[key]) for key in METRICS]
         table.add_row(group, who(method, stage), *cells)
     table.add_section()
     for name, *cells in report.quoted_rows():
@@ -230,6 +221,7 @@ def _matches(report: Report) -> Table:
         "Matches and overlap at the sampled points",
         "accuracy / precision / recall at 0.5; mutual: accuracy by the paper's labels (mutual nearest "
         "neighbours); final: shown the answer; CPU seconds",
+        ("pairs", "method"),
         (
             "hit rate",
             "inliers of\nsurest 250",
@@ -242,22 +234,20 @@ def _matches(report: Report) -> Table:
             "refine",
         ),
     )
-    previous = ""
-    for (group, method, stage), row in report.summaries().items():
-        if stage == FLOOR or row.inlier_ratio is None:  # who answers as a whole has no matches to show
-            continue
-        if group != previous and previous:
-            table.add_section()
-        table.add_row(
-            group if group != previous else "",
+    rows = (
+        (
+            group,
             who(method, stage),
-            _number(row.hit_rate, "{:.3f}"),
-            _number(row.inlier_ratio, "{:.3f}"),
+            number(row.hit_rate, "{:.3f}"),
+            number(row.inlier_ratio, "{:.3f}"),
             *_overlap(row.first_overlap),
             *_overlap(row.final_overlap),
-            *(_number(row.cpu_seconds.get(step), "{:.2f}") for step in ("look", "solve", "refine")),
+            *(number(row.cpu_seconds.get(step), "{:.2f}") for step in ("look", "solve", "refine")),
         )
-        previous = group
+        for (group, method, stage), row in report.summaries().items()
+        if stage != FLOOR and row.inlier_ratio is not None  # who answers as a whole has no matches to show
+    )
+    add_groups(table, rows)
     for place, (name, accuracy) in enumerate(report.accuracy_rows()):
         if place == 0:
             table.add_section()
@@ -266,34 +256,17 @@ def _matches(report: Report) -> Table:
 
 
 def _uncertainty(report: Report) -> Table:
-    from rich.table import Table
-
-    table = Table(
-        title="Raw uncertainty (variance of the sampled overlap) by place and by pair",
-        caption="border: of the overlap; plain, rich: the quarters of its inside with the least and the most "
-        "relief; AUC: probability that the former is more uncertain than the latter",
-    )
     headings = ("border", "inside", "outside", "plain", "rich", "AUC\nborder, inside", "AUC\nplain, rich")
-    for heading in ("method", "look"):
-        table.add_column(heading)
-    for heading in (*headings, "pairs\nthat fail", "others", "AUC\nfailing pairs"):
-        table.add_column(heading, justify="right")
+    table = make_table(
+        "Raw uncertainty (variance of the sampled overlap) by place and by pair",
+        "border: of the overlap; plain, rich: the quarters of its inside with the least and the most "
+        "relief; AUC: probability that the former is more uncertain than the latter",
+        ("method", "look"),
+        (*headings, "pairs\nthat fail", "others", "AUC\nfailing pairs"),
+    )
     for (method, look), row in report.uncertainties().items():
         values = (*row.places.values(), row.border_auc, row.plain_auc, row.failed, row.right, row.failed_auc)
-        table.add_row(method, look, *(_number(value, "{:.3f}") for value in values))
-    return table
-
-
-def make_table(title: str, caption: str, headings: tuple[str, ...], first: str = "pairs") -> Table:
-    """Return an empty table whose first columns are ``first`` and the method."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(title), caption=escape(caption))
-    table.add_column(first)
-    table.add_column("method")
-    for heading in headings:
-        table.add_column(heading, justify="right")
+        table.add_row(method, look, *(number(value, "{:.3f}") for value in values))
     return table
 
 
@@ -306,17 +279,8 @@ def who(method: str, stage: str) -> str:
     return escape(f"{method} + refinement" if stage == REFINED else method)
 
 
-def share_cell(share: Share) -> str:
-    """Write a share with its interval, as markup."""
-    return f"{share.share:.1%} \\[{100 * share.low:.0f}-{100 * share.high:.0f}]"
-
-
 def _overlap(summary: OverlapSummary | None) -> tuple[str, str]:
     if summary is None:
         return "-", "-"
     parts = (summary.accuracy, summary.precision, summary.recall)
-    return " / ".join(_number(part, "{:.3f}") for part in parts), f"{summary.accuracy_mutual:.3f}"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
+    return " / ".join(number(part, "{:.3f}") for part in parts), f"{summary.accuracy_mutual:.3f}"

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from utopic_cli.benchmark import trial_scans, trial_solids
+from utopic_cli.benchmark.held_out import held_out
 from utopic_cli.benchmark.labelled import Trial
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.synthesis.scan_pair import DegeneratePair
@@ -96,11 +97,10 @@ def bench_half(shapes: ShapeLibrary) -> ShapeLibrary:
 
 def _half(shapes: ShapeLibrary, parity: int) -> ShapeLibrary:
     """Choose by a hash of the name, so that a library that grows moves no shape to the other half."""
-    split = "test" if "test" in shapes.splits else "val"
-    held_out = shapes.select(split)
-    hashes = np.array([zlib.crc32(name.encode()) for name in held_out.names.tolist()])
+    library, split = held_out(shapes)
+    hashes = np.array([zlib.crc32(name.encode()) for name in library.names.tolist()])
     chosen = np.flatnonzero(hashes % 2 == parity)
     if not len(chosen):
-        raise InputError(f"the library's {len(held_out)} '{split}' shapes can't be halved; give more shapes")
-    meshes = [held_out.mesh(int(i)) for i in chosen]
-    return pack(meshes, held_out.names[chosen], held_out.splits[chosen], held_out.sets[chosen])
+        raise InputError(f"the library's {len(library)} '{split}' shapes can't be halved; give more shapes")
+    meshes = [library.mesh(int(i)) for i in chosen]
+    return pack(meshes, library.names[chosen], library.splits[chosen], library.sets[chosen])

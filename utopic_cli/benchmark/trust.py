@@ -20,6 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from utopic_cli.benchmark import trial_folder
+from utopic_cli.benchmark.held_out import made_of
 from utopic_cli.benchmark.labelled import Trial
 from utopic_cli.benchmark.metrics import pose_error
 from utopic_cli.benchmark.pool import each
@@ -33,7 +34,6 @@ from utopic_cli.model.weights import load_weights
 from utopic_cli.pipeline import register
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import RegistrationResult
-from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
 __all__ = ["Outcome", "TrustReport", "render", "run", "run_folder"]
@@ -144,10 +144,8 @@ def _measure(
 
 
 def _made_of(shapes: ShapeLibrary, data: str, seed: int, number: int) -> Trial:
-    try:
+    with made_of(data):
         return trial(shapes, seed, number)
-    except DegeneratePair as error:
-        raise InputError(f"{data}: {error}; give more or other shapes") from error
 
 
 def _task(make: Callable[[int], Trial], options: AlignOptions) -> Callable[[int], Outcome]:

@@ -9,14 +9,13 @@ import numpy as np
 
 from utopic_cli.benchmark.chart import Chart
 from utopic_cli.benchmark.reliability import risk_coverage
+from utopic_cli.benchmark.reports import number, share
 from utopic_cli.benchmark.trust_report import (
     LEAST_RIGHT,
     MOST_WRONG,
     TrustReport,
     hindsight,
     met_in_words,
-    number,
-    share,
 )
 from utopic_cli.benchmark.web import document, figure, plain_table
 

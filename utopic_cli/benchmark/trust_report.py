@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from utopic_cli.benchmark.reliability import (
     reliability_bins,
     threshold_for,
 )
-from utopic_cli.benchmark.synthetic_summary import Share
+from utopic_cli.benchmark.reports import json_by_rows, make_table, number, share
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -225,9 +224,7 @@ class TrustReport:
             "by_kind": [{"kind": kind, **asdict(row)} for kind, row in self.kinds().items()],
             "reliability_bins": [asdict(one) for one in self.bins],
         }
-        head = json.dumps({**self.settings, **found}, indent=2, allow_nan=False)
-        lines = ",\n    ".join(json.dumps(asdict(outcome), allow_nan=False) for outcome in self.outcomes)
-        return f'{head[:-2]},\n  "trials": [\n    {lines}\n  ]\n}}\n'
+        return json_by_rows({**self.settings, **found}, "trials", map(asdict, self.outcomes))
 
 
 def render(report: TrustReport, console: Console) -> None:
@@ -249,40 +246,18 @@ def hindsight(report: TrustReport) -> str:
     )
 
 
-def share(value: Share | None) -> str:
-    """Write a share with its 95 % interval."""
-    if value is None:
-        return "-"
-    return f"{value.share:.1%} of {value.of} [{100 * value.low:.1f}-{100 * value.high:.1f}]"
-
-
-def number(value: float | None, form: str) -> str:
-    """Write a number, or a dash where there is none."""
-    return "-" if value is None else form.format(value)
-
-
 def met_in_words(met: bool | None) -> str:
     """Say whether a target is met; nothing where that can't be told."""
     return "" if met is None else "yes" if met else "no"
 
 
-def _table(title: str, caption: str, headings: tuple[str, ...]) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(title), caption=escape(caption))
-    table.add_column("")
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    return table
-
-
 def _targets(report: TrustReport) -> Table:
     from rich.markup import escape
 
-    table = _table(
+    table = make_table(
         report.title,
         f"[95 % Wilson interval]; {hindsight(report)}",
+        ("",),
         ("measured", "target", "met"),
     )
     for what, measured, target, met in report.targets():
@@ -291,10 +266,11 @@ def _targets(report: TrustReport) -> Table:
 
 
 def _kinds(report: TrustReport) -> Table:
-    table = _table(
+    table = make_table(
         "By kind of trial",
         "right: under 5 degrees and under 5 % of the larger scan's extent; disjoint, different, mirrored: "
         "nothing is right",
+        ("",),
         ("trials", "right", "trusted\nright", "trusted\nwrong", "mean\nconfidence", "CPU, s"),
     )
     for kind, row in report.kinds().items():
@@ -305,10 +281,12 @@ def _kinds(report: TrustReport) -> Table:
 def _bins(report: TrustReport) -> Table:
     from rich.markup import escape
 
-    table = _table(
-        "Reliability", "answers of like confidence: a calibrated one is right as often as it says",
+    table = make_table(
+        "Reliability",
+        "answers of like confidence: a calibrated one is right as often as it says",
+        ("",),
         ("answers", "mean\nconfidence", "right"),
-    )  # fmt: skip
+    )
     for one in report.bins:
         name = f"{one.low:.1f}-{one.high:.1f}"
         table.add_row(name, str(one.count), number(one.confidence, "{:.3f}"), escape(share(one.right)))

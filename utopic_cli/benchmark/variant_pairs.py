@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from utopic_cli.benchmark.held_out import made_of
 from utopic_cli.benchmark.pair_metrics import (
     MatchMeasures,
     OverlapMeasures,
@@ -28,7 +29,6 @@ from utopic_cli.look import look_both_sides
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.preprocess import PreparedPair, prepare
 from utopic_cli.synthesis.pairs import ScanPair
-from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
 FLOOR = "floor"
@@ -141,10 +141,8 @@ def answer(
     Raises:
         InputError: no such pair can be made of the shapes.
     """
-    try:
+    with made_of(data):
         pair = protocol.pair(shapes, seed, number)
-    except DegeneratePair as error:
-        raise InputError(f"{data}: {error}; give more or other shapes") from error
     prepared = prepare(pair.source, pair.target, points, clean=protocol.cleans)
     known = known_nodes(prepared, pair.gt_T_target_source, protocol.overlap_radius(prepared))
     view = predict(model, prepared, seed)

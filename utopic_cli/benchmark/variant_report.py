@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from utopic_cli.benchmark.paired import Difference, Figure, mean_figure
 from utopic_cli.benchmark.plots import recall_plot
 from utopic_cli.benchmark.quoted import METRICS
-from utopic_cli.benchmark.synthetic_report import share_cell
+from utopic_cli.benchmark.reports import json_by_rows, make_table, share_cell
 from utopic_cli.benchmark.variant_pairs import FLOOR, SOLVERS, PairResult
 from utopic_cli.benchmark.variant_summary import (
     MEASURES,
@@ -23,7 +22,6 @@ from utopic_cli.benchmark.variant_summary import (
 from utopic_cli.benchmark.variants import CONTROL, FULL, Row
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
 SCHEMA_VERSION = 1
@@ -132,15 +130,11 @@ class VariantReport:
             }
             for run in self.runs
         ]
-        head = json.dumps(
-            {**self.settings, "reading": self.losses(), "summary": rows}, indent=2, allow_nan=False
+        summary = {"reading": self.losses(), "summary": rows}
+        answers = (
+            {"variant": run.row.variant, **result.to_dict()} for run in self.runs for result in run.results
         )
-        answers = ",\n    ".join(
-            json.dumps({"variant": run.row.variant, **result.to_dict()}, allow_nan=False)
-            for run in self.runs
-            for result in run.results
-        )
-        return f'{head[:-2]},\n  "answers": [\n    {answers}\n  ]\n}}\n'
+        return json_by_rows({**self.settings, **summary}, "answers", answers)
 
     def _run(self, variant: str) -> VariantRun:
         return next(run for run in self.runs if run.row.variant == variant)
@@ -179,16 +173,8 @@ class VariantReport:
         return f"told apart from the full network: {', '.join(apart)}; everything else is within noise"
 
 
-def render(report: VariantReport, console: Console) -> None:
-    """Print the tables and their reading."""
-    for table in report.tables():
-        console.print(table)
-    for line in report.losses():
-        console.print(line, markup=False, highlight=False)
-
-
 def _paper(report: VariantReport) -> Table:
-    table = _table(
+    table = make_table(
         report.title,
         "mean ± standard error over the pairs, no refinement; lengths in radii of the object; paper's "
         "solve: assignment and overlap-weighted Procrustes; floor: Procrustes on the true correspondences; "
@@ -225,7 +211,7 @@ def _paper(report: VariantReport) -> Table:
 
 
 def _matches(report: VariantReport) -> Table:
-    table = _table(
+    table = make_table(
         "Training, matches, overlap and recall",
         "mean ± standard error over the pairs; hit rate: overlapping points whose best match is right; "
         "overlap accuracy at 0.5 and at first sight (mutual: by narrower labels, mutual nearest neighbours); "
@@ -266,7 +252,7 @@ def _matches(report: VariantReport) -> Table:
 
 
 def _differences(report: VariantReport) -> Table:
-    table = _table(
+    table = make_table(
         "Differences from the full network on the same pairs",
         "variant minus full ± half the 95 % interval over the pairs; * told apart: chance among the pairs "
         "makes so large a difference in fewer than 5 % of such tables, and it is larger than that of the "
@@ -289,18 +275,6 @@ def _differences(report: VariantReport) -> Table:
                 for one in MEASURES
             ),
         )
-    return table
-
-
-def _table(title: str, caption: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(title), caption=escape(caption))
-    for heading in words:
-        table.add_column(heading)
-    for heading in numbers:
-        table.add_column(heading, justify="right")
     return table
 
 

@@ -4,31 +4,18 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
+
+from utopic_cli.page.skeleton import resource, whole_page
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-HERE = Path(__file__).parent
-
 
 def document(template: str, fills: Mapping[str, str]) -> str:
-    """Fill a template of this folder: each ``{{name}}`` with ``fills[name]``, HTML as it is.
-
-    ``head`` is what the heads of all pages share, with ``fills["title"]`` and the style sheet.
-    """
-    head = _filled("page_head.html", {**fills, "style": (HERE / "page.css").read_text(encoding="utf-8")})
-    return _filled(template, {**fills, "head": head})
-
-
-def _filled(template: str, fills: Mapping[str, str]) -> str:
-    pieces = (HERE / template).read_text(encoding="utf-8").split("{{")
-    text = pieces[0]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        text += fills[name] + rest
-    return text
+    """Fill a template of this folder, the body of a page whose title is ``fills["title"]`` (HTML)."""
+    style, body = resource(__package__, "page.css"), resource(__package__, template)
+    return whole_page(fills["title"], style, body, fills)
 
 
 def plain_table(

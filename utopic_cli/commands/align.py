@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from utopic_cli.commands.console import (
+    DEFAULTS,
     SOLVING,
     WRITING,
     Colormap,
     Console,
     Debug,
     Device,
+    MostPoints,
     Overwrite,
     Quiet,
     Seed,
@@ -25,7 +27,7 @@ from utopic_cli.commands.console import (
     stopwatch,
     to_stdout,
 )
-from utopic_cli.commands.outputs import OutputPlan, check_outputs, make_outputs, plan_outputs, write_outputs
+from utopic_cli.commands.outputs import OutputPlan, check_outputs, plan_outputs, write_answer
 from utopic_cli.commands.transformation import files_behind
 from utopic_cli.config import DEFAULT_COLOUR_MAP, AlignOptions, ColourMapName
 
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
     from utopic_cli.io.scan import Scan
     from utopic_cli.result import RegistrationResult
 
-_DEFAULTS = AlignOptions()
 
 NOT_TRUSTED = 3
 
@@ -110,14 +111,11 @@ def align(
             rich_help_panel=SOLVING,
         ),
     ] = None,
-    points: Annotated[
-        int,
-        typer.Option(min=50, help="Most points per scan the network sees.", rich_help_panel=SOLVING),
-    ] = _DEFAULTS.points,
+    points: MostPoints = DEFAULTS.points,
     refine: Annotated[
         bool,
         typer.Option(help="Refine at full resolution after the network's estimate.", rich_help_panel=SOLVING),
-    ] = _DEFAULTS.refine,
+    ] = DEFAULTS.refine,
     solver: Annotated[
         Literal["auto", "svd", "consensus"],
         typer.Option(
@@ -125,10 +123,10 @@ def align(
             rich_help_panel=SOLVING,
         ),
     ] = "auto",
-    weights: Weights = _DEFAULTS.weights,
+    weights: Weights = DEFAULTS.weights,
     device: Device = "auto",
-    threads: Threads = _DEFAULTS.threads,
-    seed: Seed = _DEFAULTS.seed,
+    threads: Threads = DEFAULTS.threads,
+    seed: Seed = DEFAULTS.seed,
     exit_zero: Annotated[
         bool,
         typer.Option("--exit-zero", help="Exit with 0 even if the answer is not to be trusted."),
@@ -236,7 +234,6 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
         from utopic_cli import pipeline
         from utopic_cli.io.scan import read_scan
         from utopic_cli.io.transformation import read_transformation
-        from utopic_cli.report import build_report, report_bytes
 
         timings_s: dict[str, float] = {}
         with stopwatch(timings_s, "read"):
@@ -252,9 +249,15 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
             source.cloud, target.cloud, request.options, initial=initial, progress=progress
         )
         progress("writing")
-        report = build_report(source, target, result, timings_s)
-        contents = make_outputs(request.plan, source, target, result, report_bytes(report), request.colormap)
-        write_outputs(request.plan, contents, request.overwrite)
+        report = write_answer(
+            request.plan,
+            source,
+            target,
+            result,
+            colormap=request.colormap,
+            overwrite=request.overwrite,
+            timings_s=timings_s,
+        )
     outcome = AlignOutcome(source, target, result, report)
     _say_summary(outcome, request.plan, console)
     return outcome

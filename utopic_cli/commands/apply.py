@@ -52,6 +52,8 @@ def apply(
     *transformations, path = files
     if not transformations:
         raise UsageError("give a transformation and a scan: utopic apply T.txt in.ply -o out.ply")
+    if output.is_dir():
+        raise UsageError(f"{output}: is a folder; name a file in it: -o {output / path.name}")
     if output.suffix.lower() != path.suffix.lower():
         raise UsageError(f"{output}: the scan keeps its format; let the name end in '{path.suffix}'")
     plan = OutputPlan(files=(("aligned", output),))

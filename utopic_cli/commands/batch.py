@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from utopic_cli.commands.console import (
+    DEFAULTS,
     RUNNING,
     SOLVING,
+    WRITING,
     Console,
     Debug,
     Device,
+    MostPoints,
     Overwrite,
     Quiet,
     Seed,
@@ -28,8 +31,6 @@ if TYPE_CHECKING:
     from utopic_cli.multiway.outcome import BatchOutcome
     from utopic_cli.multiway.plan import BatchPlan, BatchRequest
 
-_OUTPUTS = "What to write"
-_DEFAULTS = AlignOptions()
 
 MOST_FAILURES_SAID = 5
 
@@ -39,7 +40,7 @@ def batch(
         list[Path], typer.Argument(metavar="INPUT...", help="A folder of scans, a pattern, or files.")
     ],
     out_dir: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where everything goes.", rich_help_panel=_OUTPUTS)
+        Path, typer.Option(metavar="DIR", help="Where everything goes.", rich_help_panel=WRITING)
     ],
     pairs: Annotated[
         str,
@@ -55,7 +56,7 @@ def batch(
             "--merge",
             help="Write merged.ply: all scans of the largest group, colours and the scalar fields of most "
             "scans kept, the field 'scan' says which; merged-2.ply and so on for further groups.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = False,
     merge_voxel: Annotated[
@@ -63,12 +64,10 @@ def batch(
         typer.Option(
             metavar="SIZE",
             help="Thin merged clouds to one point a cell of this size, in the files' unit.",
-            rich_help_panel=_OUTPUTS,
+            rich_help_panel=WRITING,
         ),
     ] = None,
-    html: Annotated[
-        bool, typer.Option("--html", help="Write report.html.", rich_help_panel=_OUTPUTS)
-    ] = False,
+    html: Annotated[bool, typer.Option("--html", help="Write report.html.", rich_help_panel=WRITING)] = False,
     resume: Annotated[
         bool,
         typer.Option(
@@ -80,11 +79,8 @@ def batch(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be done, write nothing.")
     ] = False,
-    points: Annotated[
-        int,
-        typer.Option(min=50, help="Most points per scan the network sees.", rich_help_panel=SOLVING),
-    ] = _DEFAULTS.points,
-    weights: Weights = _DEFAULTS.weights,
+    points: MostPoints = DEFAULTS.points,
+    weights: Weights = DEFAULTS.weights,
     workers: Annotated[
         int,
         typer.Option(
@@ -115,7 +111,7 @@ def batch(
     threads: Annotated[
         int, typer.Option(min=1, help="CPU threads of each process.", rich_help_panel=RUNNING)
     ] = 1,
-    seed: Seed = _DEFAULTS.seed,
+    seed: Seed = DEFAULTS.seed,
     quiet: Quiet = False,
     verbose: Verbose = False,
     debug: Debug = False,
@@ -155,11 +151,18 @@ def batch(
             voxel=merge_voxel,
             page=html,
         )
-        outcome = None if dry_run else run_batch(request, progress=progress)
+        said: list[str] = []
+
+        def warn(plan: BatchPlan) -> None:  # hours before the summary says it of the scans
+            said.extend(plan.scans.notes)
+            console.warnings((*said, *(scan.problem for scan in plan.scans.scans if scan.problem)))
+
+        outcome = None if dry_run else run_batch(request, progress=progress, planned=warn)
         plan = plan_batch(request) if outcome is None else None
     if plan is not None:
         _say_plan(plan, request)
     if outcome is not None:
+        console.warnings(tuple(note for note in outcome.notes if note not in said))
         _say_outcome(outcome, request, console)
         if outcome.exit_code:
             raise typer.Exit(outcome.exit_code)
@@ -180,8 +183,14 @@ def _say_plan(plan: BatchPlan, request: BatchRequest) -> None:
     if plan.earlier:
         _say_earlier(request, len(recorded))
     for scan in scans:
-        fate = scan.problem or (f"copy of {scan.copy_of}" if scan.copy_of else "to align")
+        if scan.problem:
+            word = "no scan" if scan.doubtful else "left out"
+            typer.echo(printable(f"{word}  {scan.problem}"))
+            continue
+        fate = f"copy of {scan.copy_of}" if scan.copy_of else "to align"
         typer.echo(printable(f"scan  {scan.name}  {scan.path}  {fate}"))
+    for note in plan.scans.notes:
+        typer.echo(printable(f"note  {note}"))
     if plan.first is None:
         typer.echo(
             f"pairs  chosen by what the network sees of each of {len(plan.usable)} scans; "
@@ -210,7 +219,6 @@ def _say_earlier(request: BatchRequest, recorded: int) -> None:
 def _say_outcome(outcome: BatchOutcome, request: BatchRequest, console: Console) -> None:
     from utopic_cli.multiway.folder import results
 
-    console.warnings(outcome.notes)
     placed = sum(entry.group is not None for entry in outcome.scans)
     wanted = sum(entry.passed_over is None for entry in outcome.scans)
     groups = outcome.model.groups

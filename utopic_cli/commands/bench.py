@@ -9,7 +9,6 @@ import typer
 from typer.models import CommandInfo
 
 from utopic_cli.commands.bench_options import (
-    DEFAULTS,
     Baselines,
     HtmlOut,
     JsonOut,
@@ -19,6 +18,7 @@ from utopic_cli.commands.bench_options import (
     table_console,
 )
 from utopic_cli.commands.console import (
+    DEFAULTS,
     MEASURING,
     Console,
     Debug,

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from utopic_cli.commands.bench_options import JsonOut, Points, Workers, table_console
+from utopic_cli.commands.bench_options import JsonOut, Outputs, Points, Workers, table_console
 from utopic_cli.commands.console import (
+    DEFAULTS,
     MEASURING,
     WRITING,
     Console,
@@ -24,8 +25,6 @@ from utopic_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from utopic_cli.multiway.trial import TrialRow
-
-_DEFAULTS = AlignOptions()
 
 
 def batch_bench(
@@ -54,13 +53,13 @@ def batch_bench(
             rich_help_panel=WRITING,
         ),
     ] = None,
-    weights: Weights = _DEFAULTS.weights,
-    points: Points = _DEFAULTS.points,
+    weights: Weights = DEFAULTS.weights,
+    points: Points = DEFAULTS.points,
     workers: Workers = 1,
     json_out: JsonOut = None,
     overwrite: Overwrite = False,
     device: Device = "auto",
-    seed: Seed = _DEFAULTS.seed,
+    seed: Seed = DEFAULTS.seed,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -70,11 +69,10 @@ def batch_bench(
 
     Example: [bold]utopic bench batch --scans 20,50 --drawn 100,300 --keep trial[/bold]
     """
-    from utopic_cli.io.output import check_writable, write_atomically
-
     counts = _counts("--scans", scans)
     further = _counts("--drawn", drawn) if drawn else []
-    check_writable([] if json_out is None else [json_out], overwrite)
+    outputs = Outputs(json_out, None, overwrite)
+    outputs.check()
     console = Console(quiet=quiet)
     with console.progress() as step:
         step("loading libraries")
@@ -84,11 +82,7 @@ def batch_bench(
         rows = run_trials(
             counts, options, drawn=further, workers=workers, seed=seed, folder=keep, progress=step
         )
-    if json_out is not None:
-        write_atomically(
-            Path(json_out), to_json(rows, options, workers, seed).encode("ascii"), overwrite=overwrite
-        )
-        console.line(f"wrote {json_out}")
+    outputs.write_texts(lambda: to_json(rows, options, workers, seed), str, console)  # no page
     _print_table(rows)
 
 
@@ -100,17 +94,18 @@ def _counts(option: str, text: str) -> list[int]:
 
 
 def _print_table(rows: list[TrialRow]) -> None:
-    from rich.table import Table
+    from utopic_cli.benchmark.reports import make_table
 
-    table = Table(
-        "scans", "objects", "pairs", "of all", "a scan", "a pair", "scans and pairs", "all else", "memory",
-        "groups", "placed", "wrong pairs", "worst rotation", "worst place",
-        title="Simulated scans of several objects, mixed",
-        caption="Times are wall time of one process. Memory: this process + the largest worker. "
+    table = make_table(
+        "Simulated scans of several objects, mixed",
+        "Times are wall time of one process. Memory: this process + the largest worker. "
         "~: estimated; answers of pairs are drawn from those of other rows, so groups say little there.",
+        (),
+        (
+            "scans", "objects", "pairs", "of all", "a scan", "a pair", "scans and pairs", "all else",
+            "memory", "groups", "placed", "wrong pairs", "worst rotation", "worst place",
+        ),
     )  # fmt: skip
-    for column in table.columns:
-        column.justify = "right"
     for row in rows:
         about = "~" if row.drawn else ""
         memory = f"{row.own_mb:.0f} + {row.worker_mb:.0f} MB" if row.own_mb and row.worker_mb else ""

@@ -8,24 +8,24 @@ from typing import Annotated
 import typer
 
 from utopic_cli.commands.bench_options import (
+    Common,
     Data,
-    HtmlOut,
-    JsonOut,
-    Outputs,
     Points,
     Workers,
     countdown,
     open_data,
     table_console,
+    with_common_options,
 )
-from utopic_cli.commands.console import MEASURING, Console, Debug, Device, Overwrite, Quiet, Seed, Weights
+from utopic_cli.commands.console import DEFAULTS, MEASURING, Console, Weights
 from utopic_cli.config import AlignOptions
 
-_DEFAULTS = AlignOptions()
 PAIRS = 300
 
 
+@with_common_options
 def confidence(
+    asked: Common,
     data: Data = "procedural",
     folder: Annotated[
         Path | None,
@@ -44,16 +44,9 @@ def confidence(
             rich_help_panel=MEASURING,
         ),
     ] = None,
-    weights: Weights = _DEFAULTS.weights,
-    points: Points = _DEFAULTS.points,
+    weights: Weights = DEFAULTS.weights,
+    points: Points = DEFAULTS.points,
     workers: Workers = 1,
-    json_out: JsonOut = None,
-    html_out: HtmlOut = None,
-    overwrite: Overwrite = False,
-    device: Device = "auto",
-    seed: Seed = _DEFAULTS.seed,
-    quiet: Quiet = False,
-    debug: Debug = False,
 ) -> None:
     """Labelled pairs, about half of which can be aligned: does the confidence tell which.
 
@@ -62,20 +55,19 @@ def confidence(
 
     Example: [bold]utopic bench confidence --pairs 100 --html verdict.html[/bold]
     """
-    outputs = Outputs(json_out, html_out, overwrite)
-    outputs.check()
-    console = Console(quiet=quiet)
+    asked.outputs.check()
+    console = Console(quiet=asked.quiet)
     with console.progress() as step:
         step("loading libraries")
         from utopic_cli.benchmark.trust import render, run, run_folder
         from utopic_cli.benchmark.trust_page import page
 
-        options = AlignOptions(weights=weights, points=points, device=device, seed=seed)
+        options = AlignOptions(weights=weights, points=points, device=asked.device, seed=asked.seed)
         if folder is not None:
-            report = run_folder(folder, pairs, seed, options, workers, countdown(step))
+            report = run_folder(folder, pairs, asked.seed, options, workers, countdown(step))
         else:
             shapes = open_data(data, step)
             step("starting")
-            report = run(shapes, data, pairs or PAIRS, seed, options, workers, countdown(step))
-    outputs.write_texts(report.to_json, lambda: page(report), console)
+            report = run(shapes, data, pairs or PAIRS, asked.seed, options, workers, countdown(step))
+    asked.outputs.write_texts(report.to_json, lambda: page(report), console)
     render(report, table_console())

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from utopic_cli.commands.console import (
+    DEFAULTS,
     MEASURING,
     RUNNING,
+    SHAPES,
     WRITING,
     Console,
     Debug,
@@ -23,7 +25,6 @@ from utopic_cli.commands.console import (
     Seed,
     complete_weights,
 )
-from utopic_cli.config import AlignOptions
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from utopic_cli.benchmark.result_page import AnyReport
     from utopic_cli.synthesis.shapes import ShapeLibrary
 
-DEFAULTS = AlignOptions()
 TABLE_WIDTH = 160  # in files and pipes, which have no width of their own
 REGISTRATIONS = "open3d-ransac, open3d-ransac-fine, open3d-fgr, open3d-icp, kiss-matcher, small-gicp"
 
@@ -50,7 +50,7 @@ HtmlOut = Annotated[
 Data = Annotated[
     str,
     typer.Option(
-        metavar="procedural|DIR|modelnet40:DIR",
+        metavar=SHAPES,
         help="Shapes that pairs are made of; only those held out from training are used.",
         rich_help_panel=MEASURING,
     ),
@@ -146,26 +146,40 @@ class Outputs:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the protocols on synthetic pairs are asked for alike."""
+class Common:
+    """What most protocols are asked for alike."""
 
-    pairs: int
-    weights: list[str] | None
-    baselines: str
-    points: int
-    workers: int
     outputs: Outputs
     device: str
     seed: int
     quiet: bool
 
 
-def _asked(
-    pairs: Pairs = 300,
-    weights: SeveralWeights = None,
-    baselines: Contestants = "",
-    points: Points = DEFAULTS.points,
-    workers: Workers = 1,
+def with_options_of(collect: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return what gives a function, after its own options, those of another.
+
+    Args:
+        collect: the other; the function's first parameter receives what it returns.
+    """
+    shared = inspect.signature(collect, eval_str=True).parameters
+
+    def give(command: Callable[..., Any]) -> Callable[..., Any]:
+        _, *own = inspect.signature(command, eval_str=True).parameters.values()
+
+        def run(**given: Any) -> Any:
+            collected = collect(**{name: given.pop(name) for name in shared})
+            return command(collected, **given)
+
+        parameters = [*own, *shared.values()]
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        run.__name__, run.__doc__ = command.__name__, command.__doc__
+        return run
+
+    return give
+
+
+def _common(
     json_out: JsonOut = None,
     html_out: HtmlOut = None,
     overwrite: Overwrite = False,
@@ -173,29 +187,39 @@ def _asked(
     seed: Seed = DEFAULTS.seed,
     quiet: Quiet = False,
     debug: Debug = False,
+) -> Common:
+    return Common(Outputs(json_out, html_out, overwrite), device, seed, quiet)
+
+
+with_common_options = with_options_of(_common)
+
+
+@dataclass(frozen=True)
+class Asked(Common):
+    """What the protocols on synthetic pairs are asked for alike."""
+
+    pairs: int
+    weights: list[str] | None
+    baselines: str
+    points: int
+    workers: int
+
+
+@with_common_options
+def _asked(
+    common: Common,
+    pairs: Pairs = 300,
+    weights: SeveralWeights = None,
+    baselines: Contestants = "",
+    points: Points = DEFAULTS.points,
+    workers: Workers = 1,
 ) -> Asked:
-    outputs = Outputs(json_out, html_out, overwrite)
-    return Asked(pairs, weights, baselines, points, workers, outputs, device, seed, quiet)
+    return Asked(
+        **vars(common), pairs=pairs, weights=weights, baselines=baselines, points=points, workers=workers
+    )
 
 
-def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command, after its own options, those that all protocols on synthetic pairs share.
-
-    Args:
-        command: its first parameter, ``asked``, receives them.
-    """
-    _, *own = inspect.signature(command, eval_str=True).parameters.values()
-    shared = inspect.signature(_asked, eval_str=True).parameters
-
-    def run(**given: Any) -> None:
-        asked = _asked(**{name: given.pop(name) for name in shared})
-        command(asked, **given)
-
-    parameters = [*own, *shared.values()]
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    return run
+with_shared_options = with_options_of(_asked)
 
 
 def open_data(data: str, step: Callable[[str], None]) -> ShapeLibrary:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from utopic_cli.commands.bench_options import (
-    DEFAULTS,
     Asked,
     Data,
     Rotations,
@@ -19,7 +18,7 @@ from utopic_cli.commands.bench_options import (
     table_console,
     with_shared_options,
 )
-from utopic_cli.commands.console import Console
+from utopic_cli.commands.console import DEFAULTS, Console
 
 if TYPE_CHECKING:
     from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol
@@ -177,7 +176,8 @@ def measure(asked: Asked, data: str, make_protocol: Callable[[], AnyProtocol]) -
     with console.progress() as step:
         step("loading libraries")
         from utopic_cli.benchmark.contestants import check_baselines
-        from utopic_cli.benchmark.synthetic import render, run
+        from utopic_cli.benchmark.reports import render
+        from utopic_cli.benchmark.synthetic import run
 
         check_baselines(baselines)
         shapes = open_data(data, step)

@@ -11,20 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from utopic_cli.commands.bench_options import HtmlOut, JsonOut, Outputs, countdown, table_console
-from utopic_cli.commands.console import Console, Debug, Device, Overwrite, Quiet, Seed
-from utopic_cli.config import AlignOptions
+from utopic_cli.commands.bench_options import Common, countdown, open_data, table_console, with_common_options
+from utopic_cli.commands.console import DEFAULTS, SHAPES, Console
 from utopic_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from utopic_cli.benchmark.protocols import CropProtocol
     from utopic_cli.benchmark.variant_pairs import PairResult
     from utopic_cli.benchmark.variant_report import VariantReport
-    from utopic_cli.commands.variant_runs import Budget, Experiment
+    from utopic_cli.commands.variant_runs import Experiment
+    from utopic_cli.commands.variant_settings import Budget
     from utopic_cli.synthesis.shapes import ShapeLibrary
     from utopic_cli.training.config import TrainingConfig
 
-_DEFAULTS = AlignOptions()
 
 AT_WORK = 5.0
 """Seconds that a variant takes at least unless it was finished before."""
@@ -43,7 +42,7 @@ is finished is not done again. The tables may share a folder: variants they have
 
 
 @dataclass(frozen=True)
-class Asked:
+class Asked(Common):
     """What the three commands are asked for alike."""
 
     table: str
@@ -56,16 +55,13 @@ class Asked:
     points: int
     workers: int
     resume: bool
-    outputs: Outputs
-    device: str
-    seed: int
-    quiet: bool
 
 
 def variant_command(table: str) -> Callable[..., None]:
     """Return the command of one of ``TABLES``: they differ in nothing but the variants."""
 
     def command(
+        common: Common,
         out: Annotated[
             Path, typer.Option(metavar="DIR", help="Folder of the experiment: a run for each variant.")
         ],
@@ -79,7 +75,7 @@ def variant_command(table: str) -> Callable[..., None]:
         data: Annotated[
             str,
             typer.Option(
-                metavar="procedural|DIR|modelnet40:DIR",
+                metavar=SHAPES,
                 help="Shapes to train on; those held out from training make the test pairs.",
             ),
         ] = "procedural",
@@ -92,30 +88,22 @@ def variant_command(table: str) -> Callable[..., None]:
         pairs: Annotated[int, typer.Option(min=2, help="Number of test pairs.")] = 100,
         points: Annotated[
             int, typer.Option(min=50, help="Most points per cloud in the test.")
-        ] = _DEFAULTS.points,
+        ] = DEFAULTS.points,
         workers: Annotated[
             int, typer.Option(min=1, help="Processes that make pairs, and then answer the test pairs.")
         ] = 1,
         resume: Annotated[bool, typer.Option("--resume", help="Go on with the experiment in DIR.")] = False,
-        json_out: JsonOut = None,
-        html_out: HtmlOut = None,
-        overwrite: Overwrite = False,
-        device: Device = "auto",
-        seed: Seed = _DEFAULTS.seed,
-        quiet: Quiet = False,
-        debug: Debug = False,
     ) -> None:
-        outputs = Outputs(json_out, html_out, overwrite)
         run(
             Asked(
-                table, out, minutes, train_pairs, data, config, pairs, points, workers, resume, outputs,
-                device, seed, quiet,
+                **vars(common), table=table, out=out, minutes=minutes, train_pairs=train_pairs, data=data,
+                config=config, pairs=pairs, points=points, workers=workers, resume=resume,
             )
         )  # fmt: skip
 
     example = f"utopic bench {table} --out {table} --train-pairs 5000 --html {table}.html"
     command.__doc__ = f"{TABLES[table]}{MORE}\nExample: [bold]{example}[/bold]"
-    return command
+    return with_common_options(command)
 
 
 def mount(bench: typer.Typer) -> None:
@@ -139,23 +127,22 @@ def run(asked: Asked) -> None:
         from utopic_cli.commands.variant_runs import folder_of_experiment
 
         before = folder_of_experiment(asked.out, asked.resume)
-        step("making shapes" if asked.data == "procedural" else f"reading shapes from {asked.data}")
-        from utopic_cli.benchmark.synthetic import held_out
-        from utopic_cli.synthesis.packing import open_shapes
+        from utopic_cli.benchmark.held_out import held_out
 
-        shapes = open_shapes(asked.data, progress=countdown(step))
+        shapes = open_data(asked.data, step)
         test, split = held_out(shapes)
     experiment = _open(asked, shapes, before, console)
     report = _measure(asked, experiment, test, split, console)
     asked.outputs.write(report, console)
-    from utopic_cli.benchmark.variant_report import render
+    from utopic_cli.benchmark.reports import render
 
     render(report, table_console())
 
 
 def _open(asked: Asked, shapes: ShapeLibrary, before: dict[str, Any] | None, console: Console) -> Experiment:
     """Start an experiment, or make sure that the folder holds this very one."""
-    from utopic_cli.commands.variant_runs import Experiment, base_config, within_budget
+    from utopic_cli.commands.variant_runs import Experiment
+    from utopic_cli.commands.variant_settings import base_config, within_budget
     from utopic_cli.model.weights import choose_device
     from utopic_cli.training.config import read_training_config
 
@@ -187,7 +174,8 @@ def _budget(
     console: Console,
 ) -> Budget:
     """Return the budget asked for, in pairs; of an experiment that is gone on with, the one it has."""
-    from utopic_cli.commands.variant_runs import budget_of_minutes, budget_of_pairs, known_budget
+    from utopic_cli.commands.variant_runs import known_budget
+    from utopic_cli.commands.variant_settings import budget_of_minutes, budget_of_pairs
     from utopic_cli.model.weights import choose_device
 
     if before is not None:

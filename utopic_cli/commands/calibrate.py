@@ -9,11 +9,9 @@ from typing import Annotated
 import typer
 
 from utopic_cli.commands.bench_options import Data, Points, Workers, countdown, open_data
-from utopic_cli.commands.console import MEASURING, Console, Debug, Device, Overwrite, Quiet, Seed
+from utopic_cli.commands.console import DEFAULTS, MEASURING, Console, Debug, Device, Overwrite, Quiet, Seed
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import OutputError
-
-_DEFAULTS = AlignOptions()
 
 
 def calibrate(
@@ -24,11 +22,11 @@ def calibrate(
     trials: Annotated[
         int, typer.Option(min=40, help="Labelled pairs to learn from.", rich_help_panel=MEASURING)
     ] = 800,
-    points: Points = _DEFAULTS.points,
+    points: Points = DEFAULTS.points,
     workers: Workers = 1,
     overwrite: Overwrite = False,
     device: Device = "auto",
-    seed: Seed = _DEFAULTS.seed,
+    seed: Seed = DEFAULTS.seed,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:

@@ -15,16 +15,20 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
-from utopic_cli.config import ColourMapName
+from utopic_cli.config import AlignOptions, ColourMapName
 from utopic_cli.errors import OutputError
 from utopic_cli.io.files import printable
 
 _DEBUG = "utopic_cli.debug"
 
+DEFAULTS = AlignOptions()
+"""What the options below are where they are not given."""
+
 MEASURING = "What to measure"
 WRITING = "What to write"
 SOLVING = "How to align"
 RUNNING = "How to run"
+SHAPES = "procedural|DIR|modelnet40:DIR"  # what --data takes
 LABEL_WIDTH = 9
 BAR_WIDTH = 16
 SECONDS_BETWEEN_LINES = 10.0  # of progress, where stderr is a file or a pipe
@@ -76,6 +80,10 @@ Weights = Annotated[
         rich_help_panel=SOLVING,
         autocompletion=complete_weights,
     ),
+]
+MostPoints = Annotated[
+    int,
+    typer.Option(min=50, help="Most points per scan the network sees.", rich_help_panel=SOLVING),
 ]
 Device = Annotated[
     Literal["auto", "cpu", "cuda", "mps"],

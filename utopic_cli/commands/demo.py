@@ -9,6 +9,7 @@ import typer
 
 from utopic_cli.commands.align import AlignOutcome, AlignRequest, run
 from utopic_cli.commands.console import (
+    DEFAULTS,
     WRITING,
     Colormap,
     Console,
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
     from utopic_cli.synthesis.scan_pair import ScanPair
 
-_DEFAULTS = AlignOptions()
-
 
 def demo(
     out_dir: Annotated[
@@ -38,10 +37,10 @@ def demo(
     ] = Path("utopic-demo"),
     colormap: Colormap = DEFAULT_COLOUR_MAP,
     overwrite: Overwrite = False,
-    weights: Weights = _DEFAULTS.weights,
+    weights: Weights = DEFAULTS.weights,
     device: Device = "auto",
-    threads: Threads = _DEFAULTS.threads,
-    seed: Seed = _DEFAULTS.seed,
+    threads: Threads = DEFAULTS.threads,
+    seed: Seed = DEFAULTS.seed,
     quiet: Quiet = False,
     verbose: Verbose = False,
     debug: Debug = False,

@@ -19,7 +19,7 @@ _ORIGINAL = "original_"
 _LEFT_OUT = re.compile(r"n(orm(al)?)?_?[xyz]|a|alpha|diffuse_alpha")
 
 
-def kept_fields(scan: Scan) -> dict[str, np.ndarray]:
+def kept_fields(scan: Scan) -> tuple[dict[str, np.ndarray], str | None]:
     """Return the scalar fields and the colours of a scan's file.
 
     Args:
@@ -30,6 +30,7 @@ def kept_fields(scan: Scan) -> dict[str, np.ndarray]:
         else float64; colours are uint8, ``original_red`` and so on. Fields are called as in the file,
         in lower case, without CloudCompare's ``scalar_``, and with ``original_`` where the name would be
         one of ours, or another's, in a PLY. Empty for meshes, whose points are drawn from the surface.
+        Then a warning where the file's layout keeps its fields from being told, or None.
 
     Raises:
         InputError: the file can't be read again, or has changed.
@@ -40,9 +41,8 @@ def kept_fields(scan: Scan) -> dict[str, np.ndarray]:
     from utopic_cli.multiway.colours import colour_fields, colours_of
     from utopic_cli.multiway.fields import COLOURS
 
-    values = {
-        name: column[scan.kept] for name, column in _values(scan).items() if not _LEFT_OUT.fullmatch(name)
-    }
+    found, lost = _values(scan)
+    values = {name: column[scan.kept] for name, column in found.items() if not _LEFT_OUT.fullmatch(name)}
     kept: dict[str, np.ndarray] = {}
     taken = {property_name(name) for name in OWN}
     colours = colour_fields(values)
@@ -58,11 +58,11 @@ def kept_fields(scan: Scan) -> dict[str, np.ndarray]:
         exact = np.can_cast(column.dtype, np.float32)
         with np.errstate(invalid="ignore"):
             kept[plain] = column.astype(np.float32 if exact else np.float64)
-    return kept
+    return kept, lost and f"its colours and scalar fields are not in the coloured clouds: {lost}"
 
 
-def _values(scan: Scan) -> dict[str, np.ndarray]:
-    """Return (R,) values of every record of a scan's file by name."""
+def _values(scan: Scan) -> tuple[dict[str, np.ndarray], str | None]:
+    """Return (R,) values of every record of a scan's file by name, and why others are lost or None."""
     from utopic_cli.io.files import read_bytes
     from utopic_cli.io.records import FormatError
     from utopic_cli.multiway.fields import find_fields, sample_size
@@ -70,12 +70,14 @@ def _values(scan: Scan) -> dict[str, np.ndarray]:
     try:
         told = getattr(scan.document.document, "fields", None)
         if told is not None:  # formats whose reader keeps them at hand
-            return dict(told(scan.records))
+            return dict(told(scan.records)), None
         data = read_bytes(scan.path)
         if hashlib.sha256(data).hexdigest() != scan.sha256:
             raise InputError(f"{scan.path}: has changed while it was aligned; run again")
         fields = find_fields(data[: sample_size(data, scan.format, len(data))], scan.format)
-        return fields.read(data, scan.records, list(fields.dtypes)) if fields.dtypes else {}
-    except (FormatError, ValueError, KeyError):
-        # A layout that only the reader of points knows: what it says of the points is not told here.
-        return {}
+        values = fields.read(data, scan.records, list(fields.dtypes)) if fields.dtypes else {}
+    except (FormatError, ValueError, KeyError) as error:
+        # A layout that only the reader of points knows.
+        why = str(error) if isinstance(error, FormatError) else f"its {scan.format.upper()} layout is unusual"
+        return {}, why
+    return values, fields.lost

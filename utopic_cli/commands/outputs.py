@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,33 +133,70 @@ def _identity(path: Path) -> Any:
     return status.st_dev, status.st_ino
 
 
-def make_outputs(
+def write_answer(
     plan: OutputPlan,
     source: Scan,
     target: Scan,
     result: RegistrationResult,
-    report: bytes,
+    *,
     colormap: ColourMapName,
-) -> dict[Path, bytes]:
-    """Make the content of every file in the plan.
+    overwrite: bool,
+    timings_s: dict[str, float] | None = None,
+) -> dict[str, Any]:
+    """Make and write every file in the plan.
 
     Args:
         plan: the files asked for.
         source: the scan that moves.
         target: the scan that stays.
-        result: the answer.
-        report: content of the report.
+        result: the answer, its arrays those of the scans' points.
         colormap: the colours of overlap and uncertainty.
+        overwrite: whether existing files may be replaced.
+        timings_s: seconds of steps outside the pipeline.
 
     Returns:
-        Content by path, in the order of writing.
+        The report. Its warnings say as well what the coloured clouds could not keep.
+
+    Raises:
+        InputError: a scan's file can't be read again, or has changed.
+        OutputError: a file can't be written.
     """
+    from utopic_cli.report import build_report, report_bytes
+
+    source, of_source = _with_kept(plan, "source", source)
+    target, of_target = _with_kept(plan, "target", target)
+    report = build_report(source, target, result, timings_s)
+    kept = {"source": of_source, "target": of_target}
+    write_outputs(
+        plan, _contents(plan, source, target, result, report_bytes(report), kept, colormap), overwrite
+    )
+    return report
+
+
+def _with_kept(plan: OutputPlan, side: str, scan: Scan) -> tuple[Scan, dict[str, np.ndarray]]:
+    """Return what a scan's coloured clouds keep of its file; a warning of the scan says what they can't."""
     from utopic_cli.commands.kept_fields import kept_fields
+
+    if not any(kind.startswith(f"{side}_") for kind, _ in plan.files):
+        return scan, {}
+    kept, lost = kept_fields(scan)
+    return (replace(scan, warnings=(*scan.warnings, lost)) if lost else scan), kept
+
+
+def _contents(
+    plan: OutputPlan,
+    source: Scan,
+    target: Scan,
+    result: RegistrationResult,
+    report: bytes,
+    kept: Mapping[str, Mapping[str, np.ndarray]],
+    colormap: ColourMapName,
+) -> dict[Path, bytes]:
+    """Make the content of every file in the plan, by path, in the order of writing."""
     from utopic_cli.io.ply_writer import merged_cloud_ply
     from utopic_cli.io.transformation import form_of, format_transformation
 
     contents: dict[Path, bytes] = {}
-    kept: dict[str, dict[str, np.ndarray]] = {}
     for kind, path in plan.files:
         if kind == "transformation":
             contents[path] = format_transformation(result.T_target_source, form_of(path) or "matrix")
@@ -174,8 +211,6 @@ def make_outputs(
             contents[path] = report
         else:
             side = kind.split("_")[0]
-            if side not in kept:
-                kept[side] = kept_fields(source if side == "source" else target)
             contents[path] = coloured_cloud(kind, source, target, result, kept[side], colormap)
     return contents
 

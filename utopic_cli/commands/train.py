@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from utopic_cli.commands.console import Console, Debug, Device, Quiet
+from utopic_cli.commands.console import SHAPES, Console, Debug, Device, Quiet
 from utopic_cli.errors import OutputError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def train(
     data: Annotated[
         str,
         typer.Option(
-            metavar="procedural|DIR|modelnet40:DIR",
+            metavar=SHAPES,
             help="Shapes made on the fly, a folder of meshes or clouds of your own, or ModelNet40.",
         ),
     ] = PROCEDURAL,

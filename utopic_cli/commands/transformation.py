@@ -65,6 +65,8 @@ def transformation(
     from utopic_cli.geometry.rigid import rotation_angle_deg
     from utopic_cli.io.transformation import SUFFIXES, form_of, format_transformation
 
+    if output is not None and output.is_dir():
+        raise UsageError(f"{output}: is a folder; name a file in it: -o {output / 'T.txt'}")
     wanted = form or (form_of(output) if output else "matrix")
     if wanted is None:
         raise UsageError(f"{output}: its name tells no form; use {', '.join(SUFFIXES)}, or --form")

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from utopic_cli.benchmark.variants import CONTROL, FULL, VARIANTS, Changes, together
+from utopic_cli.benchmark.variants import CONTROL, FULL, VARIANTS, Changes
 from utopic_cli.commands.console import Console
 from utopic_cli.commands.training_view import TrainingView
-from utopic_cli.errors import InputError, OutputError, UsageError
+from utopic_cli.commands.variant_settings import Budget, changed_config
+from utopic_cli.errors import InputError, OutputError
 from utopic_cli.io.output import check_writable, write_atomically
 from utopic_cli.model.weights import load_weights, read_card
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.training import trainer
 from utopic_cli.training.checkpoint import describe_difference
-from utopic_cli.training.config import Schedule, TrainingConfig, training_config_from
+from utopic_cli.training.config import TrainingConfig
 from utopic_cli.training.run import total_pairs
 from utopic_cli.training.start import common_start
 
@@ -29,28 +29,6 @@ EXPERIMENT = "experiment.json"
 WEIGHTS = "utopic.safetensors"
 DESCRIPTORS = "descriptors"
 SCHEMA_VERSION = 1
-PACE_SHARE, PACE_MINUTES = 0.1, 1.0
-"""The pace is measured for this share of the budget, and no longer than this."""
-
-STOPPED_EARLY = 10.0
-"""A measurement with so many seconds left was asked to end by a signal."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What each variant may cost.
-
-    Attributes:
-        pairs: shown to each variant.
-        descriptor_pairs: shown before, once for all.
-        minutes: that were asked for; None where pairs were.
-        pairs_per_s: the pace that turned minutes into pairs; None likewise.
-    """
-
-    pairs: int = 0
-    descriptor_pairs: int = 0
-    minutes: float | None = None
-    pairs_per_s: float | None = None
 
 
 def folder_of_experiment(out: Path, resume: bool) -> dict[str, Any] | None:
@@ -151,7 +129,7 @@ class Experiment:
         stage: Changes = {"schedule": {"descriptor_pairs": 0}}
         if variant == CONTROL:
             stage = {"schedule": {"descriptor_pairs": 0, "seed": self.base.schedule.seed + 1}}
-        return _changed(self.base, stage, VARIANTS[FULL if variant == CONTROL else variant])
+        return changed_config(self.base, stage, VARIANTS[FULL if variant == CONTROL else variant])
 
     def train(self, variant: str) -> Path:
         """Train a variant, or go on with it; nothing is done if it is finished.
@@ -162,7 +140,7 @@ class Experiment:
         config = self.config(variant)
         shared = {}
         if self.budget.descriptor_pairs:
-            first = _changed(self.base, {"schedule": {"joint_pairs": 0}})
+            first = changed_config(self.base, {"schedule": {"joint_pairs": 0}})
             descriptors = load_weights(str(self._run(DESCRIPTORS, first, None)))[0].state_dict()
             shared = {name: value for name, value in descriptors.items() if name.startswith("extractor.")}
         start = common_start(config.model, self.base.model, config.schedule.seed, shared)
@@ -205,90 +183,6 @@ class Experiment:
         return int(card.get("pairs_seen", 0))
 
 
-def base_config(config: TrainingConfig, seed: int) -> TrainingConfig:
-    """Return the settings that variants are changes of.
-
-    Raises:
-        InputError: they lack a part that a variant is to leave out.
-    """
-    model, loss = config.model, config.loss
-    parts = {
-        "model.overlap": model.overlap,
-        "model.uncertainty_scheme = 'sampled'": model.uncertainty_scheme == "sampled",
-        "model.positional_scheme = 'geometric'": model.positional_scheme == "geometric",
-        "loss.overlap": loss.overlap > 0,
-        "loss.completion": loss.completion > 0,
-        "loss.uncertainty": loss.uncertainty > 0,
-        "schedule.masking_from below 1": config.schedule.masking_from < 1.0,
-        "schedule.joint_pairs": config.schedule.joint_pairs > 0,
-    }
-    missing = [name for name, there in parts.items() if not there]
-    if missing:
-        raise InputError(
-            f"variants leave out parts of a full network, and the configuration has no {', '.join(missing)}"
-        )
-    return replace(config, schedule=replace(config.schedule, seed=seed))
-
-
-def within_budget(base: TrainingConfig, pairs: int) -> TrainingConfig:
-    """Return settings whose joint stage has so many pairs, the stage before in proportion."""
-    schedule = base.schedule
-    descriptor = _whole_steps(pairs * schedule.descriptor_pairs / schedule.joint_pairs, schedule)
-    return replace(
-        base,
-        schedule=replace(
-            schedule,
-            joint_pairs=pairs,
-            descriptor_pairs=descriptor if schedule.descriptor_pairs else 0,
-        ),
-    )
-
-
-def budget_of_pairs(base: TrainingConfig, pairs: int) -> Budget:
-    """Return the budget of so many pairs.
-
-    Raises:
-        UsageError: they don't fill whole steps.
-    """
-    batch = base.schedule.batch
-    if pairs < 1 or pairs % batch:
-        raise UsageError(f"--train-pairs {pairs}: give a multiple of {batch}, the pairs of a step")
-    return Budget(pairs, within_budget(base, pairs).schedule.descriptor_pairs)
-
-
-def budget_of_minutes(
-    base: TrainingConfig,
-    minutes: float,
-    shapes: ShapeLibrary,
-    device: torch.device,
-    workers: int,
-) -> Budget:
-    """Measure the pace of the full network for a short while, and return how many pairs fill the minutes.
-
-    Every variant then gets so many pairs, however long it takes: that a machine is busy now and then
-    would decide between them otherwise.
-    """
-    config = _changed(base, {"schedule": {"descriptor_pairs": 0, "validation_pairs": 1}})
-    records: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory(prefix="utopic-pace-") as folder:
-        trainer.train(
-            config,
-            shapes.select("train"),
-            shapes.select("val"),
-            Path(folder),
-            minutes=min(PACE_SHARE * minutes, PACE_MINUTES),
-            device=device,
-            workers=workers,
-            progress=records.append,
-        )
-    last = records[-1]
-    if last.get("left_s", 0.0) > STOPPED_EARLY:
-        raise KeyboardInterrupt
-    pace = last["pairs"] / max(last["elapsed_s"], 0.1)
-    pairs = _whole_steps(60.0 * minutes * pace, base.schedule)
-    return Budget(pairs, within_budget(base, pairs).schedule.descriptor_pairs, minutes, round(pace, 3))
-
-
 def known_budget(content: Mapping[str, Any], where: Path) -> Budget:
     """Return the budget of an experiment that is gone on with.
 
@@ -302,14 +196,3 @@ def known_budget(content: Mapping[str, Any], where: Path) -> Budget:
     except (TypeError, ValueError) as error:
         raise InputError(f"{where / EXPERIMENT}: its budget can't be used ({error})") from error
     return budget
-
-
-def _whole_steps(pairs: float, schedule: Schedule) -> int:
-    return max(1, round(pairs / schedule.batch)) * schedule.batch
-
-
-def _changed(base: TrainingConfig, *changes: Changes) -> TrainingConfig:
-    values = base.as_dict()
-    for section, keys in together(*changes).items():
-        values[section] = {**values[section], **keys}
-    return training_config_from(values, "the variant")

@@ -15,11 +15,11 @@ import numpy as np
 
 from utopic_cli.estimation.candidates import LEAST_SUPPORT
 from utopic_cli.estimation.meeting import MEETING, meet, self_agreement
-from utopic_cli.estimation.observability import stiffness
+from utopic_cli.estimation.observability import Twists, stiffness
 from utopic_cli.estimation.solver import Estimate
 from utopic_cli.estimation.surface import Surface
 from utopic_cli.geometry import rigid
-from utopic_cli.result import FitMeasures, Observability
+from utopic_cli.result import FitMeasures
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def collect_evidence(
     estimate: Estimate,
     seen: Seen,
     fit: FitMeasures,
-    observability: Observability | None,
+    twists: Twists | None,
     spread: float,
 ) -> Evidence:
     """Collect what speaks for and against an answer.
@@ -123,7 +123,7 @@ def collect_evidence(
         estimate: of the solver, with the answer's rivals.
         seen: by the network, shown the answer.
         fit: at full resolution.
-        observability: None where too little overlaps to tell.
+        twists: ``find_twists`` of the two surfaces under it.
         spread: see ``Evidence``.
     """
     alike = self_agreement(source, target)
@@ -152,8 +152,8 @@ def collect_evidence(
         support=float(support),
         support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
         explained=float(np.log1p(len(estimate.correspondences))),
-        fixed=_smallest_eigenvalue(observability),
-        stiffness=stiffness(source, target, transformation, meeting.likeness, alike),
+        fixed=_smallest_eigenvalue(twists),
+        stiffness=stiffness(source, target, transformation, twists, meeting.likeness, alike),
         extent=float(np.log10(max(meeting.voxels, 1))),
         seen_overlap=inside,
         seen_contrast=inside - outside,
@@ -179,9 +179,9 @@ NO_CONFLICT = 0.003
 NO_LEAD = 0.02
 
 
-def _smallest_eigenvalue(observability: Observability | None) -> float:
+def _smallest_eigenvalue(twists: Twists | None) -> float:
     """Log10 of the smallest eigenvalue over the largest, at least -5; -5 too where nothing is known."""
-    if observability is None:
+    if twists is None:
         return -5.0
-    eigenvalues = observability.eigenvalues
+    eigenvalues = twists.eigenvalues
     return float(np.log10(max(eigenvalues[0] / max(eigenvalues[-1], 1e-300), 1e-5)))

@@ -39,79 +39,8 @@ STILL = 1e-6
 """A unit twist that moves the overlap by no more turns a line about itself: nothing notices that."""
 
 
-def observe(source: Surface, target: Surface, transformation: np.ndarray) -> Observability:
-    """Look at the overlap of two aligned surfaces.
-
-    Args:
-        source: the scan that moves.
-        target: the scan that stays.
-        transformation: (4, 4) T_target_source.
-
-    Raises:
-        ValueError: fewer than six points overlap, or all of them in one place.
-    """
-    twists = _overlap_twists(source, target, transformation)
-    eigenvalues, vectors = twists.eigenvalues, twists.vectors
-    free = vectors[:, eigenvalues < FREE * eigenvalues[-1]]
-    # One voxel holds one independent measurement, however many points were averaged in it.
-    variance = float(np.mean(np.minimum(twists.offsets**2, (REACH * target.voxel) ** 2)))
-    floored = np.maximum(eigenvalues, 0.1 * FREE * eigenvalues[-1])
-    scale = np.concatenate([np.full(3, 1.0 / twists.radius), np.ones(3)])  # back from omega * radius to omega
-    covariance = (vectors * (variance / (twists.count * floored))) @ vectors.T * np.outer(scale, scale)
-    return Observability(
-        np.maximum(eigenvalues, 0.0),
-        _named(free, twists.radius, twists.centre),
-        covariance,
-        twists.centre,
-        twists.count,
-    )
-
-
-def stiffness(
-    source: Surface, target: Surface, transformation: np.ndarray, likeness: float, alike: float
-) -> float:
-    """Tell how much worse two surfaces agree once the source is moved by ``DISPLACED`` of their size.
-
-    The normal matrix goes by infinitely small motions and by normals, which noise tilts; here the source
-    is really moved, both ways along each of the motions that are fixed least.
-
-    Args:
-        source: the scan that moves.
-        target: the scan that stays.
-        transformation: (4, 4) T_target_source.
-        likeness: of ``meet`` under it.
-        alike: ``self_agreement`` of the two.
-
-    Returns:
-        The least fall of the likeness: 0 or less where a displaced source fits as well, and where too
-        little overlaps to tell.
-    """
-    try:
-        twists = _overlap_twists(source, target, transformation)
-    except ValueError:
-        return 0.0
-    extent = max(float(np.linalg.norm(np.ptp(surface.points, axis=0))) for surface in (source, target))
-    falls = []
-    for twist in twists.vectors.T[:LEAST_FIXED]:
-        omega, shift = twist[:3] / twists.radius, twist[3:]
-        speed = np.sqrt(np.mean(np.sum((np.cross(omega, twists.arms) + shift) ** 2, axis=1)))
-        if speed < STILL:
-            return 0.0
-        for amount in (DISPLACED * extent / speed, -DISPLACED * extent / speed):
-            displaced = _screw(amount * omega, amount * (shift - np.cross(omega, twists.centre)))
-            falls.append(likeness - meet(source, target, displaced @ transformation, alike).likeness)
-    return float(min(falls))
-
-
-def _screw(omega: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """The motion (4, 4) that a twist about the origin makes in one unit of time."""
-    x, y, z = omega
-    generator = np.array([[0.0, -z, y, shift[0]], [z, 0.0, -x, shift[1]], [-y, x, 0.0, shift[2]], [0.0] * 4])
-    return np.asarray(expm(generator))
-
-
 @dataclass(frozen=True)
-class _Twists:
+class Twists:
     """The eigenvectors of the point-to-plane problem in an overlap.
 
     Attributes:
@@ -136,24 +65,104 @@ class _Twists:
         return len(self.arms)
 
 
-def _overlap_twists(source: Surface, target: Surface, transformation: np.ndarray) -> _Twists:
+def find_twists(source: Surface, target: Surface, transformation: np.ndarray) -> Twists | None:
+    """Look at the overlap of two aligned surfaces.
+
+    Args:
+        source: the scan that moves.
+        target: the scan that stays.
+        transformation: (4, 4) T_target_source.
+
+    Returns:
+        Its twists; None if fewer than six points overlap, or all of them in one place.
+    """
     moved = rigid.apply(transformation, source.points)
     turned = source.normals @ transformation[:3, :3].T
     distance, index = target.tree.query(moved, distance_upper_bound=REACH * target.voxel)
     found = np.isfinite(distance)
     found[found] = np.einsum("nd,nd->n", turned[found], target.normals[index[found]]) > AGREEING
     if found.sum() < 6:
-        raise ValueError(f"only {int(found.sum())} points overlap")
+        return None
     points, normals = target.points[index[found]], target.normals[index[found]]
     offsets = np.einsum("nd,nd->n", moved[found] - points, normals)
     centre = points.mean(axis=0)
     arms = points - centre
     radius = float(np.sqrt(np.einsum("nd,nd->n", arms, arms).mean()))
     if not radius > 0:
-        raise ValueError("all overlapping points coincide")
+        return None
     rows = np.concatenate([np.cross(arms / radius, normals), normals], axis=1)  # (K, 6)
     eigenvalues, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    return _Twists(eigenvalues, vectors, centre, arms, radius, offsets)
+    return Twists(eigenvalues, vectors, centre, arms, radius, offsets)
+
+
+def observe(twists: Twists, voxel: float) -> Observability:
+    """Tell which motions an overlap fixes, and how well.
+
+    Args:
+        twists: of the overlap.
+        voxel: of the target.
+    """
+    eigenvalues, vectors = twists.eigenvalues, twists.vectors
+    free = vectors[:, eigenvalues < FREE * eigenvalues[-1]]
+    # One voxel holds one independent measurement, however many points were averaged in it.
+    variance = float(np.mean(np.minimum(twists.offsets**2, (REACH * voxel) ** 2)))
+    floored = np.maximum(eigenvalues, 0.1 * FREE * eigenvalues[-1])
+    scale = np.concatenate([np.full(3, 1.0 / twists.radius), np.ones(3)])  # back from omega * radius to omega
+    covariance = (vectors * (variance / (twists.count * floored))) @ vectors.T * np.outer(scale, scale)
+    return Observability(
+        np.maximum(eigenvalues, 0.0),
+        _named(free, twists.radius, twists.centre),
+        covariance,
+        twists.centre,
+        twists.count,
+    )
+
+
+def stiffness(
+    source: Surface,
+    target: Surface,
+    transformation: np.ndarray,
+    twists: Twists | None,
+    likeness: float,
+    alike: float,
+) -> float:
+    """Tell how much worse two surfaces agree once the source is moved by ``DISPLACED`` of their size.
+
+    The normal matrix goes by infinitely small motions and by normals, which noise tilts; here the source
+    is really moved, both ways along each of the motions that are fixed least.
+
+    Args:
+        source: the scan that moves.
+        target: the scan that stays.
+        transformation: (4, 4) T_target_source.
+        twists: ``find_twists`` of the three.
+        likeness: of ``meet`` under it.
+        alike: ``self_agreement`` of the two.
+
+    Returns:
+        The least fall of the likeness: 0 or less where a displaced source fits as well, and where too
+        little overlaps to tell.
+    """
+    if twists is None:
+        return 0.0
+    extent = max(float(np.linalg.norm(np.ptp(surface.points, axis=0))) for surface in (source, target))
+    falls = []
+    for twist in twists.vectors.T[:LEAST_FIXED]:
+        omega, shift = twist[:3] / twists.radius, twist[3:]
+        speed = np.sqrt(np.mean(np.sum((np.cross(omega, twists.arms) + shift) ** 2, axis=1)))
+        if speed < STILL:
+            return 0.0
+        for amount in (DISPLACED * extent / speed, -DISPLACED * extent / speed):
+            displaced = _screw(amount * omega, amount * (shift - np.cross(omega, twists.centre)))
+            falls.append(likeness - meet(source, target, displaced @ transformation, alike).likeness)
+    return float(min(falls))
+
+
+def _screw(omega: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """The motion (4, 4) that a twist about the origin makes in one unit of time."""
+    x, y, z = omega
+    generator = np.array([[0.0, -z, y, shift[0]], [z, 0.0, -x, shift[1]], [-y, x, 0.0, shift[2]], [0.0] * 4])
+    return np.asarray(expm(generator))
 
 
 def _named(free: np.ndarray, radius: float, centre: np.ndarray) -> tuple[FreeMotion, ...]:

@@ -88,13 +88,8 @@ def open_e57(data: bytes, *, check: bool = True) -> E57File:
     Raises:
         FormatError: a checksum is wrong, or the header promises what is not there.
     """
-    if data[:8] != b"ASTM-E57" or len(data) < _HEADER.size:
-        raise FormatError("is no E57 file by its content; check what it is")
-    _, major, _, length, xml_physical, xml_length, page = _HEADER.unpack_from(data)
-    if major != 1:
-        raise FormatError(f"is E57 version {major}; version 1 is read")
-    if not 64 <= page <= 1 << 20 or length != len(data) or length % page:
-        raise FormatError(f"its E57 header promises {length} bytes but there are {len(data)}; {_DAMAGED}")
+    check_header(data, len(data))
+    *_, xml_physical, xml_length, page = _HEADER.unpack_from(data)
     pages = np.frombuffer(data, np.uint8).reshape(-1, page)
     if check:
         wrong = int((_checksums(pages[:, :-_CHECKSUM]) != pages[:, -_CHECKSUM:]).any(axis=1).sum())
@@ -105,6 +100,25 @@ def open_e57(data: bytes, *, check: bool = True) -> E57File:
     if xml_at + xml_length > len(content):
         raise FormatError(f"has an E57 XML section beyond its end; {_DAMAGED}")
     return E57File(page, content, xml_at, content[xml_at : xml_at + xml_length])
+
+
+def check_header(data: bytes, size: int) -> None:
+    """Compare a file's header with its size.
+
+    Args:
+        data: the file, or some of its beginning.
+        size: of the file, in bytes.
+
+    Raises:
+        FormatError: it is no E57 file of version 1, or promises what is not there.
+    """
+    if data[:8] != b"ASTM-E57" or len(data) < _HEADER.size:
+        raise FormatError("is no E57 file by its content; check what it is")
+    _, major, _, length, _, _, page = _HEADER.unpack_from(data)
+    if major != 1:
+        raise FormatError(f"is E57 version {major}; version 1 is read")
+    if not 64 <= page <= 1 << 20 or length != size or length % page:
+        raise FormatError(f"its E57 header promises {length} bytes but there are {size}; {_DAMAGED}")
 
 
 @cache

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from utopic_cli.errors import InputError
 
+EMPTY = "the file is empty; export or copy it again"
 _OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -35,7 +36,7 @@ def read_bytes(path: Path) -> bytes:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(f"{path}: cannot be read ({reason}); check the path and its permissions") from None
     if not data:
-        raise InputError(f"{path}: the file is empty; export or copy it again")
+        raise InputError(f"{path}: {EMPTY}")
     return data
 
 

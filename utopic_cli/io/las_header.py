@@ -174,19 +174,31 @@ def parse_header(data: bytes, *, whole: bool = True) -> LasHeader:
     offset = np.array(struct.unpack_from("<3d", data, _OFFSET))
     if not ((scale > _TINIEST) & (scale < _LARGEST) & (np.abs(offset) < _LARGEST)).all():  # NaN neither
         raise FormatError("has a LAS scale or offset that is no usable number; export it again")
-    if whole and not compressed and count * record_size > len(data) - points_at:
-        raise FormatError(
-            f"its LAS header promises {count} points but there are at most"
-            f" {(len(data) - points_at) // record_size}; the file is cut short, copy it again"
-        )
     if count == 0:
         raise FormatError("has no points; check what it is, or export it again")
     starts = [struct.unpack_from("<Q", data, place)[0] for place in _tail_places(minor)]
     tail_at = min([start for start in starts if points_at < start <= len(data)], default=len(data))
     vlrs = _walk_vlrs(data, size, points_at, vlr_count)
-    return LasHeader(
+    header = LasHeader(
         minor, compressed, points_at, point_format, record_size, count, scale, offset, vlrs, tail_at
     )
+    if whole:
+        check_count(header, len(data))
+    return header
+
+
+def check_count(header: LasHeader, size: int) -> None:
+    """Compare the promised number of points with the size of the file, unless it is compressed.
+
+    Raises:
+        FormatError: it promises more.
+    """
+    left = size - header.points_at
+    if not header.compressed and header.count * header.record_size > left:
+        raise FormatError(
+            f"its LAS header promises {header.count} points but there are at most"
+            f" {left // header.record_size}; the file is cut short, copy it again"
+        )
 
 
 def _tail_places(minor: int) -> tuple[int, ...]:

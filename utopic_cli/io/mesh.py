@@ -46,10 +46,10 @@ def read_mesh(data: bytes, kind: str, rng: np.random.Generator) -> Records:
     Raises:
         FormatError: the file is damaged, promises more than it holds, or has no surface.
     """
-    _check_promises(data, kind)
+    check_promises(data, kind, len(data))
     import trimesh  # heavy, and not needed for scans
 
-    file_type = "stl_ascii" if kind == "stl" and not _is_binary_stl(data) else kind
+    file_type = "stl_ascii" if kind == "stl" and not _is_binary_stl(data, len(data)) else kind
     try:
         with _silenced(logging.getLogger("trimesh")):
             scene = trimesh.load(io.BytesIO(data), file_type=file_type, process=False)
@@ -100,20 +100,29 @@ def _sample(triangles: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray
     return points, crosses[chosen] / doubled_areas[chosen, None]
 
 
-def _is_binary_stl(data: bytes) -> bool:
+def _is_binary_stl(data: bytes, size: int) -> bool:
     """A binary STL's length follows from its count; ascii ones may not even start with solid."""
-    return len(data) >= 84 and len(data) == 84 + 50 * struct.unpack_from("<I", data, 80)[0]
+    return size >= 84 and size == 84 + 50 * struct.unpack_from("<I", data, 80)[0]
 
 
-def _check_promises(data: bytes, kind: str) -> None:
-    """Compare promised counts with the bytes there are, before trimesh allocates for them."""
+def check_promises(data: bytes, kind: str, size: int) -> None:
+    """Compare promised counts with the bytes there are, before trimesh allocates for them.
+
+    Args:
+        data: the file, or some of its beginning.
+        kind: ``stl``, ``off`` or ``glb``.
+        size: of the file, in bytes.
+
+    Raises:
+        FormatError: it promises more than it holds, or is no such file.
+    """
     if kind == "stl":
-        if not _is_binary_stl(data) and (not data.lstrip().startswith(b"solid") or b"\0" in data):
-            if len(data) < 84:
+        if not _is_binary_stl(data, size) and (not data.lstrip().startswith(b"solid") or b"\0" in data):
+            if size < 84:
                 raise FormatError("is too short for an STL; copy it again")
             promised = struct.unpack_from("<I", data, 80)[0]
             raise FormatError(
-                f"its STL header promises {promised} triangles but there are {(len(data) - 84) / 50:g};"
+                f"its STL header promises {promised} triangles but there are {(size - 84) / 50:g};"
                 " the file is damaged or cut short, copy it again"
             )
     elif kind == "off":
@@ -122,24 +131,26 @@ def _check_promises(data: bytes, kind: str) -> None:
             raise FormatError("does not start like an OFF file; check what it is, or export it again")
         vertices, faces = int(counts[1]), int(counts[2])
         lines = sum(1 for line in data.splitlines() if line.strip() and not line.lstrip().startswith(b"#"))
-        if vertices + faces + 1 > lines:
+        if len(data) == size and vertices + faces + 1 > lines:
             raise FormatError(
                 f"its OFF header promises {vertices} vertices and {faces} faces but there are {lines} lines;"
                 " the file is cut short or damaged, copy it again"
             )
     else:
-        _check_glb(data)
+        _check_glb(data, size)
 
 
-def _check_glb(data: bytes) -> None:
+def _check_glb(data: bytes, whole: int) -> None:
     if len(data) < 20 or data[:4] != b"glTF":
         raise FormatError("does not start like a GLB file; check what it is, or export it again")
     _, length, size = struct.unpack_from("<III", data, 4)
-    if length > len(data) or size > len(data) - 20:
+    if length > whole or size > whole - 20:
         raise FormatError(
-            f"its GLB header promises {length} bytes but there are {len(data)};"
+            f"its GLB header promises {length} bytes but there are {whole};"
             " the file is cut short, copy it again"
         )
+    if len(data) < 20 + size:
+        return
     try:
         content = json.loads(data[20 : 20 + size])
         # An accessor without data means zeros, as many as it likes to promise.
@@ -147,7 +158,7 @@ def _check_glb(data: bytes) -> None:
         outside = [b for b in content.get("buffers", []) + content.get("images", []) if "uri" in b]
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         raise FormatError("its GLB description is damaged; export it again") from None
-    if any(not 0 <= count <= len(data) for count in counts):
+    if any(not 0 <= count <= whole for count in counts):
         raise FormatError("its GLB description promises data the file does not hold; export it again")
     if any(not str(b["uri"]).startswith("data:") for b in outside):
         raise FormatError("refers to other files, which are never opened; export it as one GLB")

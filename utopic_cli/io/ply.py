@@ -27,14 +27,19 @@ def read_ply(data: bytes) -> Records:
         FormatError: the header is unsound, or the data is not what it promises.
     """
     header = parse_header(data)
-    vertex = _vertex(header)
+    vertex = vertex_of(header)
     wanted = _wanted(vertex)
     if header.order:
         return _read_binary(data, header, vertex, wanted)
     return _read_ascii(data, header, vertex, wanted)
 
 
-def _vertex(header: PlyHeader) -> Element:
+def vertex_of(header: PlyHeader) -> Element:
+    """Return the element that holds the points.
+
+    Raises:
+        FormatError: there is none, or it has no coordinates.
+    """
     found = [element for element in header.elements if element.name == "vertex"]
     if len(found) != 1:
         raise FormatError(f"its PLY header has {len(found)} vertex elements, not one; export it again")
@@ -98,7 +103,7 @@ def _walk(
     """Find an element's end and where its wanted properties are, checking it is all there."""
     left = len(body) - start
     if element.count * element.smallest > left:
-        raise _truncated(element, left // element.smallest)
+        raise truncated(element, left // element.smallest)
     size = _uniform_size(body, start, element)
     if size is None:
         return _walk_lists(body, start, element, wanted, "big" if order == ">" else "little")
@@ -159,7 +164,7 @@ def _walk_lists(
                 raise FormatError(f"its PLY {element.name} {record} has a list of {entries}; export it again")
             position += length_size + entries * size
         if position > total:
-            raise _truncated(element, record)
+            raise truncated(element, record)
     columns = [
         Column(element.properties[i].dtype, element.count, starts=starts[:, row])
         for row, i in enumerate(wanted)
@@ -167,7 +172,8 @@ def _walk_lists(
     return position, tuple(columns)
 
 
-def _truncated(element: Element, found: int) -> FormatError:
+def truncated(element: Element, found: int) -> FormatError:
+    """Return what to say of a file with fewer records than its header promises."""
     return FormatError(
         f"its PLY header promises {element.count} {element.name} records but there are at most {found};"
         " the file is cut short or damaged, copy it again"
@@ -231,7 +237,7 @@ def _ascii_lines(data: bytes, header: PlyHeader) -> tuple[list[bytes], dict[str,
     for element in header.elements:
         count = element.count if element.properties else 0  # a record without values has no line
         if first + count > len(filled):
-            raise _truncated(element, len(filled) - first)
+            raise truncated(element, len(filled) - first)
         spans[element.name] = filled[first : first + count]
         first += count
     return lines, spans

@@ -72,6 +72,13 @@ def scalar_cloud_ply(
     return "\n".join(header).encode("utf-8") + table.tobytes()
 
 
+def points_ply(points: np.ndarray) -> bytes:
+    """Return (N, 3) float64 points, NaN included, as a binary PLY with nothing else in it."""
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [*(f"property double {name}" for name in "xyz"), "end_header", ""]
+    return "\n".join(header).encode("ascii") + np.ascontiguousarray(points, "<f8").tobytes()
+
+
 def property_name(name: str) -> str:
     """Return the property that holds a scalar field.
 

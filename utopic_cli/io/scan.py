@@ -30,16 +30,17 @@ FEWEST_POINTS = 50
 _LINE = 1e-5
 _LARGEST_COORDINATE = 1e100  # beyond it squares overflow, and nothing was measured
 
+TEXTS = ("xyz", "txt", "pts", "asc", "csv")
+MESHES = ("stl", "off", "glb")
 _READERS: dict[str, Callable[[bytes], Records]] = {
     "ply": read_ply,
     "pcd": read_pcd,
     "obj": read_obj,
     **dict.fromkeys(("las", "laz"), read_las),
     "e57": read_e57,
-    **dict.fromkeys(("xyz", "txt", "pts", "asc", "csv"), read_text),
+    **dict.fromkeys(TEXTS, read_text),
 }
-_MESHES = ("stl", "off", "glb")
-SUFFIXES = tuple(f".{name}" for name in (*_READERS, *_MESHES))
+SUFFIXES = tuple(f".{name}" for name in (*_READERS, *MESHES))
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,25 @@ def read_scan(path: str | os.PathLike[str], *, seed: int = 0, to_align: bool = T
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES and os.path.isfile(path):
         raise InputError(f"{path}: is no known scan format; use one of {' '.join(SUFFIXES)}")
-    data = read_bytes(path)
-    kind = suffix[1:]
+    return parse_scan(path, read_bytes(path), seed=seed, to_align=to_align)
+
+
+def parse_scan(path: Path, data: bytes, *, seed: int = 0, to_align: bool = True) -> Scan:
+    """Parse the bytes of a scan file strictly; see ``read_scan``.
+
+    Args:
+        path: what to call it; its suffix, a known one, says the format.
+        data: the whole file.
+        seed: of the points drawn from a mesh.
+        to_align: whether the points have to fix a transformation.
+
+    Raises:
+        InputError: it is not sound, or can't be aligned.
+    """
+    kind = path.suffix.lower()[1:]
     try:
-        _check_magic(data, kind)
-        if kind in _MESHES:
+        check_magic(data, kind)
+        if kind in MESHES:
             records = read_mesh(data, kind, np.random.default_rng(seed))
         else:
             records = _READERS[kind](data)
@@ -111,12 +126,12 @@ def read_scan(path: str | os.PathLike[str], *, seed: int = 0, to_align: bool = T
         else:
             _check_coordinates(points, len(records.points))
     except FormatError as error:
-        raise InputError(f"{path}: {_printable(str(error))}") from None
+        raise InputError(f"{path}: {printable_line(str(error))}") from None
     except MemoryError:
         raise InputError(f"{path}: is too large for this machine's memory; thin it out first") from None
     # A mesh that is only moved is moved itself, whatever was drawn from it.
-    told = records.warnings if to_align or kind not in _MESHES else ()
-    warnings = [_printable(warning) for warning in told]
+    told = records.warnings if to_align or kind not in MESHES else ()
+    warnings = [printable_line(warning) for warning in told]
     dropped = len(records.points) - len(kept)
     if dropped and to_align:
         warnings.append(f"{dropped} of {len(records.points)} points are NaN or infinite and were left out")
@@ -133,8 +148,12 @@ def read_scan(path: str | os.PathLike[str], *, seed: int = 0, to_align: bool = T
     return Scan(path, cloud, kept, len(records.points), kind, digest, tuple(warnings), records)
 
 
-def _check_magic(data: bytes, kind: str) -> None:
-    """Refuse a file whose first bytes belong to another format than its suffix."""
+def check_magic(data: bytes, kind: str) -> None:
+    """Refuse a file whose first bytes belong to another format than its suffix.
+
+    Raises:
+        FormatError: they do.
+    """
     head = data[:64].lstrip()
     content = None
     if head.startswith((b"ply\n", b"ply\r")):
@@ -191,7 +210,7 @@ def _count_distinct(points: np.ndarray) -> int:
     return count if count >= FEWEST_POINTS else len(np.unique(points, axis=0))
 
 
-def _printable(message: str) -> str:
+def printable_line(message: str) -> str:
     """Return a message as one plain line, whatever of the file's bytes it quotes."""
     return "".join(c if c.isprintable() else "?" for c in message)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from utopic_cli.io.ascii_table import is_number, move_lines, parse_table
+from utopic_cli.io.pose_rows import poses_in
 from utopic_cli.io.records import FormatError, Motion, Records
 
 _BOM = b"\xef\xbb\xbf"
@@ -16,6 +17,7 @@ _COORDINATES = ("x", "y", "z")
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("normalx", "normaly", "normalz"))
 _DECIMAL_COMMA = re.compile(rb"[+-]?\d*,\d+,?")
 _PADDED_INTEGER = re.compile(rb"0\d+")  # as in the 05 of 1,05
+_SAMPLE_LINES = 100
 _UNIT_LENGTH = 1e-2  # tolerance on the length of what is taken for a normal
 _DOUBLE = np.dtype("f8")  # text declares no types
 
@@ -35,7 +37,7 @@ class _Text:
         return self.end.join(lines)
 
 
-def read_text(data: bytes) -> Records:
+def read_text(data: bytes, *, whole: bool = True) -> Records:
     """Read points from text.
 
     Blanks, tabs, commas or semicolons separate the values. Lines starting with ``#`` or ``//``
@@ -43,24 +45,31 @@ def read_text(data: bytes) -> Records:
     Columns beyond the coordinates are kept; three that are named or look like normals (unit
     length in every row) turn with the points.
 
+    Args:
+        data: the file.
+        whole: all of it; else its beginning, of which no promise is asked.
+
     Raises:
-        FormatError: no points, rows of differing lengths, decimal commas, or fewer rows than
-            promised.
+        FormatError: no points, rows of differing lengths, decimal commas, fewer rows than
+            promised, or poses in the place of points.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise FormatError("is UTF-16 text; save it as UTF-8 or ASCII")
     if b"\0" in data:
         raise FormatError("holds binary data, not text; check what it is, or export it again")
+    poses = poses_in(data)
+    if poses is not None:
+        raise FormatError(f"is {poses}, not points; 'utopic transformation' reads it, name the scan here")
     end = b"\n" if b"\n" in data or b"\r" not in data else b"\r"
     lines = data.split(end)
-    rows = [i for i, line in enumerate(lines) if _is_content(line)]
+    rows = [i for i, line in enumerate(lines) if is_content(line)]
     if not rows:
         raise FormatError("has no points; check what it is, or export it again")
     warnings: list[str] = []
     header = _names_before(lines, rows)
     if not any(is_number(token) for token in re.split(rb"[\s,;]+", _clean(lines[rows[0]])) if token):
         header = lines[rows.pop(0)]
-    rows, promised = _without_count(lines, rows)
+    rows, promised = _without_count(lines, rows, whole)
     if promised is not None and len(rows) > promised:
         warnings.append(f"its first line promises {promised} points; {len(rows) - promised} more lines kept")
         rows = rows[:promised]
@@ -80,7 +89,7 @@ def read_text(data: bytes) -> Records:
     def parse(wanted: Sequence[int]) -> np.ndarray:
         return parse_table(content, len(tokens), wanted, lambda i: f"its line {rows[i] + 1}", delimiter)
 
-    if delimiter == b"," and _looks_like_decimal_commas(content):
+    if whole and delimiter == b"," and _looks_like_decimal_commas(content):
         raise FormatError("seems to use commas both as decimal and between values; export it with points")
     values = parse(columns)  # (R, 3 or 6)
     if not named and len(tokens) >= 6 and all(map(is_number, tokens[3:6])):
@@ -93,7 +102,8 @@ def read_text(data: bytes) -> Records:
     return Records(np.ascontiguousarray(values[:, :3]), normals, document, tuple(warnings))
 
 
-def _is_content(line: bytes) -> bool:
+def is_content(line: bytes) -> bool:
+    """Tell whether a line is neither empty nor a comment."""
     line = _clean(line)
     return bool(line) and not line.startswith((b"#", b"//"))
 
@@ -102,13 +112,28 @@ def _clean(line: bytes) -> bytes:
     return line.removeprefix(_BOM).strip()
 
 
-def _without_count(lines: list[bytes], rows: list[int]) -> tuple[list[int], int | None]:
+def mostly_numbers(start: bytes) -> bool:
+    """Tell numbers, sound or not, from prose and tables of words.
+
+    Args:
+        start: the beginning of a text file.
+
+    Returns:
+        Whether most of its first lines hold three values or more, most of them numbers.
+    """
+    lines = [line for line in start.splitlines() if is_content(line)][:_SAMPLE_LINES]
+    rows = [[token for token in re.split(rb"[\s,;]+", _clean(line)) if token] for line in lines]
+    good = [len(row) >= 3 and 2 * sum(map(is_number, row)) > len(row) for row in rows]
+    return 2 * sum(good) >= max(len(good), 1)  # of two lines one may name the columns
+
+
+def _without_count(lines: list[bytes], rows: list[int], whole: bool) -> tuple[list[int], int | None]:
     """Split off a PTS count line, and check the promise."""
     text = _clean(lines[rows[0]]) if rows else b""
     if not text.isdigit():
         return rows, None
     promised, rows = int(text[:18]), rows[1:]
-    if len(rows) < promised:
+    if whole and len(rows) < promised:
         raise FormatError(
             f"its first line promises {promised} points but there are {len(rows)};"
             " the file is cut short, copy it again"

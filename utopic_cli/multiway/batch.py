@@ -12,14 +12,14 @@ import numpy as np
 
 from utopic_cli import __version__
 from utopic_cli.config import AlignOptions
-from utopic_cli.errors import InputError, UsageError
+from utopic_cli.errors import InputError, optional_part
 from utopic_cli.io.output import write_together
 from utopic_cli.multiway import folder
 from utopic_cli.multiway import pairs as choice
 from utopic_cli.multiway.edges import ScanShape
 from utopic_cli.multiway.journal import Journal, fingerprint
 from utopic_cli.multiway.lock import locked
-from utopic_cli.multiway.merge import write_merged
+from utopic_cli.multiway.merge import fields_lost, write_merged
 from utopic_cli.multiway.model import Model, build_model
 from utopic_cli.multiway.outcome import BatchOutcome, ScanEntry, pair_name
 from utopic_cli.multiway.pace import Pace, Progress
@@ -27,7 +27,8 @@ from utopic_cli.multiway.page import batch_page
 from utopic_cli.multiway.plan import BatchPlan, BatchRequest, first_pairs, plan_batch
 from utopic_cli.multiway.scans import ScanFile
 from utopic_cli.multiway.tables import poses_csv, poses_json, poses_txt, summary_csv
-from utopic_cli.multiway.tasks import DescribeJob, RegisterJob, ScanRef, make_worker
+from utopic_cli.multiway.tasks import DescribeJob, RegisterJob, ScanRef, descriptors_of, make_worker
+from utopic_cli.multiway.vocabulary import word_frequencies
 from utopic_cli.multiway.workers import Task, Workers
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def run_batch(
     *,
     progress: Progress | None = None,
     make_task: Callable[[], Task] | None = None,
+    planned: Callable[[BatchPlan], None] | None = None,
 ) -> BatchOutcome:
     """Align scans into groups and write everything asked for.
 
@@ -52,6 +54,7 @@ def run_batch(
         request: see ``BatchRequest``.
         progress: called with a word on what is at work.
         make_task: stands in for ``tasks.make_worker``, see ``Workers``.
+        planned: called with what is about to be done, once nothing is in its way.
 
     Returns:
         What it came to; its ``exit_code`` says whether all scans connect.
@@ -62,7 +65,7 @@ def run_batch(
             work in ``out_dir``. What is done stays.
         UsageError: options contradict each other, or a part that one needs is not installed.
     """
-    return _Batch(request, progress or (lambda step: None), make_task).run()
+    return _Batch(request, progress or (lambda step: None), make_task).run(planned)
 
 
 class _Batch:
@@ -79,7 +82,7 @@ class _Batch:
         self._resumed = 0
         self._waited_s = 0.0
 
-    def run(self) -> BatchOutcome:
+    def run(self, planned: Callable[[BatchPlan], None] | None) -> BatchOutcome:
         """Do everything, in order."""
         begin = time.monotonic()
         request = self._request
@@ -99,6 +102,8 @@ class _Batch:
                     # First the mark of a whole set, which it no longer is.
                     (request.out_dir / "poses.json").unlink(missing_ok=True)
                     self._journal.clear()
+                if planned is not None:
+                    planned(plan)
                 described = self._describe(plan)
                 model, records = self._align(plan, described)
                 workers.close()  # merging can do with their memory
@@ -112,12 +117,8 @@ class _Batch:
         limits = (self._request.timeout_s, self._options.threads)
         if self._request.cluster is None:
             return Workers(make_task, self._request.workers, *limits)
-        try:
+        with optional_part("--cluster needs Dask", "'utopic-cli[cluster]'"):
             from utopic_cli.multiway.cluster import Cluster
-        except ImportError as error:
-            raise UsageError(
-                f"--cluster needs Dask ({error}); install it: pip install 'utopic-cli[cluster]'"
-            ) from error
         self._progress("reaching the cluster")
         return Cluster(self._request.cluster, make_task, *limits)
 
@@ -129,7 +130,7 @@ class _Batch:
             scan = self._files[number]
             jobs.append(DescribeJob(_ref(scan), wanted))
             names.append(scan.name)
-            marks.append(self._mark("scan", wanted, scan.sha256))
+            marks.append(self._mark("scan", "descriptors" if wanted else "", scan.sha256))
         records = dict(zip(plan.usable, self._do("scans", names, marks, jobs), strict=True))
         if not any(record["status"] == "done" for record in records.values()):
             problems = [scan.problem for scan in self._files if scan.problem]
@@ -143,17 +144,19 @@ class _Batch:
         self, plan: BatchPlan, described: dict[int, Record]
     ) -> tuple[Model, dict[choice.Pair, Record]]:
         """Try pairs, round by round, until nothing more is promising."""
-        shapes, descriptors = {}, {}
+        shapes, seen = {}, {}
         for number, record in described.items():
             if record["status"] == "done":
                 content = record["description"]
                 shapes[number] = ScanShape(np.array(content["centroid"]), np.array(content["moments"]))
                 if plan.first is None:
-                    descriptors[number] = np.array(content["descriptor"])
+                    seen[number] = descriptors_of(content)
+                    del content["descriptors"]  # long, and not asked for again
         records: dict[choice.Pair, Record] = {}
         # Neighbours, and the first, are those among the scans that turned out to be readable.
         first = None if plan.first is None else first_pairs(self._request.pairs, plan.scans, sorted(shapes))
-        todo = list(first) if first is not None else choice.similar_pairs(descriptors)
+        looks = word_frequencies(seen)
+        todo = list(first) if first is not None else choice.similar_pairs(looks)
         rounds = choice.MOST_ROUNDS if plan.first is None else 1
         model = build_model(records, shapes)
         while todo and rounds:
@@ -161,7 +164,7 @@ class _Batch:
             self._progress("connecting")
             model = build_model(records, shapes)
             rounds -= 1
-            todo = choice.further_pairs(model, descriptors, set(records)) if rounds else []
+            todo = choice.further_pairs(model, looks, set(records)) if rounds else []
         return model, records
 
     def _register(self, pairs: Sequence[choice.Pair]) -> dict[choice.Pair, Record]:
@@ -219,7 +222,7 @@ class _Batch:
             record = described.get(number)
             problem = scan.problem or (record["problem"] if record else None)
             if problem is not None:
-                doubtful = scan.doubtful and record is not None and record["status"] == "refused"
+                doubtful = scan.doubtful and (not record or record["status"] == "refused")
                 reasons = (None, problem) if doubtful else (problem, None)
                 entries.append(ScanEntry(scan, None, left_out=reasons[0], passed_over=reasons[1]))
                 continue
@@ -237,6 +240,8 @@ class _Batch:
             if record["status"] == "done"
             for text in record["description"]["warnings"]
         ]
+        if self._request.merge:
+            warnings += fields_lost(self._files[number] for number in sorted(group_of))
         return BatchOutcome(
             tuple(entries),
             model,
@@ -249,6 +254,7 @@ class _Batch:
             seconds,
             self._waited_s,
             self._resumed,
+            plan.scans.aside,
         )
 
     def _write(self, outcome: BatchOutcome) -> None:

@@ -18,6 +18,7 @@ from utopic_cli.io.ascii_table import is_number, parse_table
 from utopic_cli.io.e57 import e57_document
 from utopic_cli.io.las import las_block
 from utopic_cli.io.las_header import parse_header as las_header
+from utopic_cli.io.ply import vertex_of
 from utopic_cli.io.ply_header import parse_header
 from utopic_cli.io.records import FormatError
 
@@ -34,6 +35,7 @@ _SAMPLE_LINES = 500
 _LAS_POINTS = 96  # place in a LAS file of the number of bytes before its points
 _DOUBLE = np.dtype("<f8")
 _COORDINATES = ("x", "y", "z")
+_NORMALS = {"nx", "ny", "nz", "normal_x", "normal_y", "normal_z"}
 _SPELLINGS = {
     **{spelling: name for name in COLOURS for spelling in (name[0], f"diffuse_{name}")},
     "rgba": PACKED,
@@ -50,10 +52,12 @@ class Fields:
             ``red``, ``green``, ``blue`` whatever the file calls them; coordinates are none.
         read: takes the whole file's bytes, the number of its records, and names; returns (R,)
             values by name. Raises FormatError if the file is another than the one asked.
+        lost: why what its points have besides can't be told, or None.
     """
 
     dtypes: Mapping[str, np.dtype] = field(default_factory=dict)
     read: Callable[[bytes, int, Sequence[str]], Values] = lambda data, records, names: {}
+    lost: str | None = None
 
 
 def sample_size(start: bytes, kind: str, size: int) -> int:
@@ -78,8 +82,8 @@ def find_fields(sample: bytes, kind: str) -> Fields:
         kind: its suffix without the dot, lower case.
 
     Returns:
-        No fields for layouts that are not known here: PLY whose vertices hold lists or don't come
-        first, and meshes.
+        No fields, but why they are lost, for layouts that are not known here: PLY whose vertices
+        hold lists or don't come first. None for meshes, whose points are drawn.
 
     Raises:
         FormatError: the beginning is too short to tell.
@@ -140,10 +144,11 @@ def _changed() -> FormatError:
 
 def _ply_fields(sample: bytes) -> Fields:
     header = parse_header(sample)
-    vertex = header.elements[0]
-    if vertex.name != "vertex" or vertex.has_lists:
-        return Fields()
+    vertex = vertex_of(header)
     places = _named([p.name for p in vertex.properties])
+    if vertex is not header.elements[0] or vertex.has_lists:
+        why = "its PLY vertices hold lists" if vertex.has_lists else "its PLY vertices don't come first"
+        return Fields(lost=why if places.keys() - _NORMALS else None)
     layout = np.dtype([(p.name, p.dtype) for p in vertex.properties])
 
     def read(data: bytes, records: int, names: Sequence[str]) -> Values:

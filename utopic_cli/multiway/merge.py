@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,6 +117,17 @@ def write_merged(
     return total
 
 
+def fields_lost(files: Iterable[ScanFile]) -> tuple[str, ...]:
+    """Say of which files a merged cloud can't keep what they have besides points, and why.
+
+    Raises:
+        InputError: a file can't be read any more.
+    """
+    lost = {file.path: _fields_of(file.path).lost for file in files}
+    said = "its colours and scalar fields are not in the merged cloud"
+    return tuple(f"{path}: {said}: {why}" for path, why in lost.items() if why)
+
+
 def _columns(files: Mapping[int, ScanFile], group: Sequence[int]) -> _Columns:
     """Ask all files of a group, by their beginnings, what they say of their points."""
     fields = {number: _fields_of(files[number].path) for number in group}
@@ -152,7 +163,7 @@ def _fields_of(path: Path) -> Fields:
     except OSError as error:
         raise InputError(f"{path}: can't be read any more ({error.strerror}); run again") from None
     except (FormatError, ValueError, KeyError):
-        return Fields()  # the reader of scans says what is wrong, if anything is
+        return Fields(lost=f"its {kind.upper()} layout is unusual")
 
 
 def _table(scan: Scan, number: int, transformation: np.ndarray, columns: _Columns) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from utopic_cli.multiway.aside import Aside
 from utopic_cli.multiway.model import Model
 from utopic_cli.multiway.scans import ScanFile
 
@@ -60,6 +61,7 @@ class BatchOutcome:
         seconds: wall time of this run.
         waited_s: of which jobs were waited for.
         resumed: pairs that were done before this run.
+        aside: files of the folders that are no scans.
     """
 
     scans: tuple[ScanEntry, ...]
@@ -73,6 +75,7 @@ class BatchOutcome:
     seconds: float
     waited_s: float
     resumed: int
+    aside: tuple[Aside, ...] = ()
 
     def pair_name(self, source: int, target: int) -> str:
         """Return what a pair and its file are called."""

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import html
-import json
 import math
-import re
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -19,6 +15,7 @@ from utopic_cli.multiway.colours import scan_colour
 from utopic_cli.multiway.model import FAILED, REJECTED, UNCONFIRMED, UNUSABLE, USED, PairAnswer
 from utopic_cli.multiway.outcome import NOTHING, WHOLE, BatchOutcome
 from utopic_cli.multiway.tasks import sample_of
+from utopic_cli.page.skeleton import resource, script_json, whole_page
 
 MOST_POINTS = 60_000
 """Points of a model that the page draws at most."""
@@ -52,9 +49,10 @@ def batch_page(outcome: BatchOutcome) -> bytes:
     left_out = [
         f"{entry.file.name}: {entry.left_out}" for entry in outcome.scans if entry.left_out is not None
     ]
-    script = _resource("utopic_cli.multiway", "page.js")
-    parts = {
-        "title": f"A batch of {wanted} scans",
+    title = f"A batch of {wanted} scans"
+    script = resource(__package__, "page.js")
+    fills = {
+        "title": title,
         "verdict": kind,
         "mark": mark,
         "headline": f"{placed} of {wanted} scans placed, in {groups}" if count else "No two scans connect",
@@ -68,14 +66,12 @@ def batch_page(outcome: BatchOutcome) -> bytes:
         "scans": "\n".join(_scan_row(outcome, number) for number in range(len(outcome.scans))),
         "pairs": "\n".join(_pairs_of(outcome, verdict) for verdict in _MEANING if verdict in verdicts),
         "made_by": f"utopic-cli {__version__}, weights {_text(outcome.weights['name'])}",
-        "model": json.dumps(_models(outcome), separators=(",", ":")),
+        "model": script_json(_models(outcome)),
         "script": script,
-        "script_hash": base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii"),
-        "style": _resource("utopic_cli.page", "page.css"),
     }
-    template = _resource("utopic_cli.multiway", "page.html")
-    # In one pass, so that nothing a file's name says is filled in again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template).encode("utf-8")
+    style = f"{resource('utopic_cli.page', 'page.css')}\n{resource(__package__, 'page.css')}"
+    body = resource(__package__, "page.html")
+    return whole_page(f"{title} · utopic batch", style, body, fills, only_script=script).encode("utf-8")
 
 
 def _models(outcome: BatchOutcome) -> list[dict[str, Any]]:
@@ -211,10 +207,6 @@ def _pair_row(outcome: BatchOutcome, pair: PairAnswer) -> str:
 
 def _list(texts: Any) -> str:
     return "<ul>" + "".join(f"<li>{_text(text)}</li>" for text in texts) + "</ul>" if texts else ""
-
-
-def _resource(package: str, name: str) -> str:
-    return (resources.files(package) / name).read_text(encoding="utf-8")
 
 
 def _text(text: str) -> str:

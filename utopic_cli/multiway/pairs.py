@@ -62,22 +62,22 @@ def pairs_to_first(scans: Sequence[int]) -> list[Pair]:
     return [(scan, scans[0]) for scan in scans[1:]]
 
 
-def similar_pairs(descriptors: Mapping[int, np.ndarray]) -> list[Pair]:
+def similar_pairs(looks: Mapping[int, np.ndarray]) -> list[Pair]:
     """Return ``auto``'s first pairs on many scans: the most similar ones, and some neighbours in order.
 
     Args:
-        descriptors: (D,) by scan.
+        looks: (D,) by scan, the nearer the more alike; see ``vocabulary``.
     """
-    scans = sorted(descriptors)
+    scans = sorted(looks)
     pairs = set(_probes(scans))
-    for row, distance in enumerate(_distances(descriptors)):
+    for row, distance in enumerate(_distances(looks)):
         distance[row] = np.inf
         nearest = np.argsort(distance, kind="stable")[: min(NEAREST, len(scans) - 1)]
         pairs |= {_ordered(scans[row], scans[i]) for i in nearest}
     return sorted(pairs)
 
 
-def further_pairs(model: Model, descriptors: Mapping[int, np.ndarray], tried: set[Pair]) -> list[Pair]:
+def further_pairs(model: Model, looks: Mapping[int, np.ndarray], tried: set[Pair]) -> list[Pair]:
     """Return what ``auto`` tries next: neighbours in order, pairs between groups, pairs that close loops.
 
     Neighbours in order count if there is an order (see ``PROBES``). Groups that don't connect are tried
@@ -86,15 +86,15 @@ def further_pairs(model: Model, descriptors: Mapping[int, np.ndarray], tried: se
 
     Args:
         model: of the pairs so far.
-        descriptors: (D,) by scan.
+        looks: (D,) by scan, the nearer the more alike; see ``vocabulary``.
         tried: pairs so far, in any direction.
     """
     known = {_ordered(*pair) for pair in tried}
-    room = PAIRS_PER_SCAN * len(descriptors) - len(known)
-    chain = [pair for pair in _in_order(model, sorted(descriptors)) if pair not in known]
-    between = _between(model, descriptors, known)
+    room = PAIRS_PER_SCAN * len(looks) - len(known)
+    chain = [pair for pair in _in_order(model, sorted(looks)) if pair not in known]
+    between = _between(model, looks, known)
     pairs = list(dict.fromkeys([*chain, *between, *_closing(model.pairs, known)]))
-    return pairs[: max(0, min(room, 2 * len(descriptors)))]
+    return pairs[: max(0, min(room, 2 * len(looks)))]
 
 
 def read_pairs(path: Path, scans: Sequence[ScanFile]) -> list[Pair]:
@@ -161,13 +161,13 @@ def _in_order(model: Model, scans: Sequence[int]) -> list[Pair]:
     return list(zip(scans[1:], scans, strict=False)) if hold and hold >= ORDERED * len(tried) else []
 
 
-def _between(model: Model, descriptors: Mapping[int, np.ndarray], known: set[Pair]) -> list[Pair]:
+def _between(model: Model, looks: Mapping[int, np.ndarray], known: set[Pair]) -> list[Pair]:
     """Return the most promising untried pairs between each group, or lone scan, and the others.
 
     Those are the most similar ones; each pair tried before between the same two groups counts as so much
     less alike (see ``TRIED_BEFORE``), for what did not connect with one group may belong to another.
     """
-    scans = sorted(descriptors)
+    scans = sorted(looks)
     row_of = {scan: i for i, scan in enumerate(scans)}
     group_of = model.group_of()
     _, home = np.unique([group_of.get(scan, -1 - i) for i, scan in enumerate(scans)], return_inverse=True)
@@ -179,7 +179,7 @@ def _between(model: Model, descriptors: Mapping[int, np.ndarray], known: set[Pai
                 tried[one].append(other)
                 tries[int(home[one])][int(home[other])] += 1
     found: dict[int, list[tuple[float, int, Pair]]] = defaultdict(list)  # distance, other group, pair
-    for row, distance in enumerate(_distances(descriptors)):
+    for row, distance in enumerate(_distances(looks)):
         distance[home == home[row]] = np.inf
         distance[tried[row]] = np.inf
         order = np.argsort(distance, kind="stable")
@@ -235,13 +235,12 @@ def _confirmed(answer: PairAnswer) -> bool:
     return answer.verdict == USED and answer.belief is not None and answer.belief.agree > 0
 
 
-def _distances(descriptors: Mapping[int, np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield each scan's (N,) distances to all; each number of a descriptor counts by its spread in the batch.
+def _distances(looks: Mapping[int, np.ndarray]) -> Iterator[np.ndarray]:
+    """Yield each scan's (N,) distances to all.
 
     They are made a few rows at a time: all N x N of them need not fit in memory.
     """
-    table = np.stack([descriptors[scan] for scan in sorted(descriptors)])
-    table = (table - table.mean(axis=0)) / np.maximum(table.std(axis=0), 1e-6)
+    table = np.stack([looks[scan] for scan in sorted(looks)])
     squares = np.square(table).sum(axis=1)
     for start in range(0, len(table), ROWS):
         rows = slice(start, start + ROWS)

@@ -55,7 +55,7 @@ class BatchPlan:
 
     Attributes:
         scans: the inputs.
-        usable: numbers of the scans to align: those that could be hashed, copies left out.
+        usable: numbers of the scans to align: those without a problem, copies left out.
         first: the pairs to begin with; None where the network has to describe the scans first.
         earlier: the records and results of an earlier batch in ``out_dir``.
     """
@@ -82,7 +82,7 @@ def plan_batch(request: BatchRequest) -> BatchPlan:
     check_folder(request.out_dir)
     scans = find_scans(request.inputs)
     _keep_apart(scans, request.out_dir)
-    usable = tuple(i for i, scan in enumerate(scans.scans) if scan.sha256 and scan.copy_of is None)
+    usable = tuple(i for i, scan in enumerate(scans.scans) if scan.problem is None and scan.copy_of is None)
     earlier = tuple(folder.earlier(request.out_dir))
     return BatchPlan(scans, usable, first_pairs(request.pairs, scans, usable), earlier)
 

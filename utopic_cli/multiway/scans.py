@@ -13,13 +13,12 @@ from pathlib import Path
 
 from utopic_cli.errors import InputError
 from utopic_cli.io.files import printable
+from utopic_cli.io.glance import problem_at_start, read_start
 from utopic_cli.io.scan import SUFFIXES
+from utopic_cli.multiway.aside import DOUBTFUL_SUFFIXES, Aside, said_of, why_no_scan
 
 LONGEST_NAME = 80
 """Two names and ``--.json`` fit in any file system's file name."""
-
-DOUBTFUL_SUFFIXES = (".txt", ".csv")
-"""In a folder, files of these kinds may well be no scans: one that isn't is passed over."""
 
 _BLOCK = 1 << 22
 
@@ -32,7 +31,7 @@ class ScanFile:
         name: distinct among the batch's scans, printable, without ``--`` or separators.
         path: the file.
         sha256: of its bytes; empty if it could not be read.
-        problem: why it could not be read, or None.
+        problem: why it can't be read, as far as its beginning and size tell, or None.
         copy_of: name of an earlier scan with the same bytes, or None.
         doubtful: found in a folder with a suffix that other files than scans have too.
     """
@@ -51,11 +50,14 @@ class ScanList:
 
     Attributes:
         scans: every file once.
-        notes: what a user should know: files given twice, copies, names that had to change.
+        notes: what a user should know: files given twice, copies, names that had to change, files
+            left out.
+        aside: files of folders and patterns that are no scans.
     """
 
     scans: tuple[ScanFile, ...]
     notes: tuple[str, ...]
+    aside: tuple[Aside, ...] = ()
 
 
 def find_scans(inputs: Sequence[Path]) -> ScanList:
@@ -63,15 +65,21 @@ def find_scans(inputs: Sequence[Path]) -> ScanList:
 
     Args:
         inputs: a folder stands for the scan files in it (not in its subfolders); a path that does
-            not exist is tried as a pattern; anything else is a file.
+            not exist is tried as a pattern; anything else is a file. What is no scan by name or
+            beginning is left out where nobody named it.
 
     Raises:
         InputError: an input does not exist, or there are fewer than two files.
     """
     found: list[tuple[Path, bool]] = []
-    for given in inputs:
-        found += _expanded(given)
+    aside: list[Aside] = []
     notes: list[str] = []
+    for given in inputs:
+        taken, left = _expanded(given)
+        found += taken
+        aside += left
+        if left:
+            notes.append(said_of(given, left))
     once: dict[str, tuple[Path, bool]] = {}
     for path, doubtful in found:
         place = os.path.realpath(path)
@@ -84,7 +92,8 @@ def find_scans(inputs: Sequence[Path]) -> ScanList:
         if once and not any(given.is_dir() for given in inputs):
             raise InputError(f"{where}: only one scan given; a batch needs at least two")
         count = "only one scan file" if once else "no scan files"
-        raise InputError(f"{where}: holds {count}; a batch needs at least two ({' '.join(SUFFIXES)})")
+        needed = f"a batch needs at least two ({' '.join(SUFFIXES)})"
+        raise InputError(" | ".join([f"{where}: holds {count}; {needed}", *notes]))
     files = list(once.values())
     names = distinct_names([path for path, _ in files])
     scans: list[ScanFile] = []
@@ -94,12 +103,15 @@ def find_scans(inputs: Sequence[Path]) -> ScanList:
         copy_of = holders.get(digest) if digest else None
         if copy_of is not None:
             notes.append(f"{path}: is a copy of {copy_of}; it gets the same place")
-        elif digest:
-            holders[digest] = name
+        elif problem is None:
+            problem = _problem(path)
+            if problem is None:
+                holders[digest] = name
         if name != path.stem:
             notes.append(f"{path}: is called {name} here")
-        scans.append(ScanFile(name, path, digest, problem, copy_of, doubtful))
-    return ScanList(tuple(scans), tuple(notes))
+        # What can't even be opened may be a scan.
+        scans.append(ScanFile(name, path, digest, problem, copy_of, doubtful and bool(digest)))
+    return ScanList(tuple(scans), tuple(notes), tuple(aside))
 
 
 def distinct_names(paths: Iterable[Path]) -> list[str]:
@@ -126,23 +138,46 @@ def natural_order(path: Path) -> tuple[object, ...]:
     return (*((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts)),)
 
 
-def _expanded(given: Path) -> list[tuple[Path, bool]]:
-    if given.is_dir():
-        try:
-            inside = sorted((path for path in given.iterdir() if _is_scan(path)), key=natural_order)
-        except OSError as error:
-            raise InputError(f"{given}: can't be listed ({error.strerror}); check its permissions") from None
-        return [(path, path.suffix.lower() in DOUBTFUL_SUFFIXES) for path in inside]
-    if os.path.lexists(given):
-        return [(given, False)]
-    matching = [Path(path) for path in glob.glob(str(given), recursive=True)]
-    if not matching:
+def _expanded(given: Path) -> tuple[list[tuple[Path, bool]], list[Aside]]:
+    """Return the files that an input stands for, whether each is doubtful, and what is left out."""
+    folder = given.is_dir()
+    if not folder and os.path.lexists(given):
+        return [(given, False)], []
+    try:
+        inside = given.iterdir() if folder else map(Path, glob.glob(str(given), recursive=True))
+        files = sorted((path for path in inside if _is_seen(path)), key=natural_order)
+    except OSError as error:
+        raise InputError(f"{given}: can't be listed ({error.strerror}); check its permissions") from None
+    if not (folder or files):
         raise InputError(f"{given}: no such file or folder, and no file matches it; check the path")
-    return [(path, False) for path in sorted(filter(_is_scan, matching), key=natural_order)]
+    taken, aside = [], []
+    for path in files:
+        reason = why_no_scan(path)
+        if reason is None:
+            taken.append((path, folder and path.suffix.lower() in DOUBTFUL_SUFFIXES))
+        else:
+            aside.append(Aside(path, reason))
+    return taken, aside
 
 
-def _is_scan(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not path.is_dir()
+def _is_seen(path: Path) -> bool:
+    return not path.name.startswith(".") and not path.is_dir()
+
+
+def _problem(path: Path) -> str | None:
+    """Tell what is wrong with a regular file, as far as that is seen at a glance."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        return f"{path}: is no known scan format; use one of {' '.join(SUFFIXES)}"
+    try:
+        problem = problem_at_start(*read_start(path), suffix[1:])
+    except OSError as error:
+        return _unread(path, error)
+    return problem and f"{path}: {problem}"
+
+
+def _unread(path: Path, error: OSError) -> str:
+    return f"{path}: can't be read ({error.strerror}); check the path and its permissions"
 
 
 def _plain(text: str) -> str:
@@ -165,5 +200,5 @@ def _hashed(path: Path) -> tuple[str, str | None]:
             while block := stream.read(_BLOCK):
                 digest.update(block)
     except OSError as error:
-        return "", f"{path}: can't be read ({error.strerror}); check the path and its permissions"
+        return "", _unread(path, error)
     return digest.hexdigest(), None

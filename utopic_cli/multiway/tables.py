@@ -48,7 +48,8 @@ def poses_json(outcome: BatchOutcome) -> bytes:
             {"file": str(entry.file.path), "reason": entry.passed_over}
             for entry in outcome.scans
             if entry.passed_over is not None
-        ],
+        ]
+        + [{"file": str(one.path), "reason": one.reason} for one in outcome.aside],
         "pairs": [_pair_entry(outcome, index) for index in range(len(model.pairs))],
         "notes": list(outcome.notes),
     }

@@ -17,6 +17,7 @@ from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError
 from utopic_cli.io.scan import Scan, read_scan
 from utopic_cli.multiway.journal import fingerprint
+from utopic_cli.multiway.vocabulary import LENGTH, shorten
 from utopic_cli.multiway.workers import NotNow
 
 MOST_POINTS_HELD = 6_000_000
@@ -24,8 +25,6 @@ MOST_POINTS_HELD = 6_000_000
 
 SAMPLE = 2000
 """Points of a scan that its description holds, to draw it."""
-
-DESCRIPTOR_DECIMALS = 4
 
 
 @dataclass(frozen=True)
@@ -38,10 +37,10 @@ class ScanRef:
 
 @dataclass(frozen=True)
 class DescribeJob:
-    """Describe a scan; ``descriptor``: what the network sees of it, too."""
+    """Describe a scan; ``descriptors``: what the network sees of it, too."""
 
     scan: ScanRef
-    descriptor: bool
+    descriptors: bool
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def make_worker(options: AlignOptions, version: str, card: str) -> Callable[[Job
 
     def work(job: Job) -> dict[str, Any]:
         if isinstance(job, DescribeJob):
-            return describe(reader(job.scan), options, job.descriptor)
+            return describe(reader(job.scan), options, job.descriptors)
         try:
             both = reader(job.source), reader(job.target)
         except InputError as error:  # it could be read when it was described
@@ -95,12 +94,12 @@ def make_worker(options: AlignOptions, version: str, card: str) -> Callable[[Job
     return work
 
 
-def describe(scan: Scan, options: AlignOptions, descriptor: bool) -> dict[str, Any]:
+def describe(scan: Scan, options: AlignOptions, descriptors: bool) -> dict[str, Any]:
     """Return a scan's size and shape as JSON-ready data.
 
     Keys: ``points``; ``centroid`` (3) and ``moments`` (3, 3), the covariance of the points, file
-    units; ``warnings``; ``sample``, see ``sample_of``; ``descriptor`` if asked for, see
-    ``pooled_descriptor``.
+    units; ``warnings``; ``sample``, see ``sample_of``; ``descriptors`` if asked for, see
+    ``descriptors_of``.
     """
     points = scan.cloud.points
     centroid = points.mean(axis=0)
@@ -113,12 +112,15 @@ def describe(scan: Scan, options: AlignOptions, descriptor: bool) -> dict[str, A
         "moments": (centred.T @ centred / len(points)).tolist(),
         "warnings": list(scan.warnings),
         # As text it is small on the disk and in memory, however many scans there are.
-        "sample": base64.b64encode(centred[drawn].astype("<f4").tobytes()).decode("ascii"),
+        "sample": _as_text(centred[drawn].astype("<f4")),
     }
-    if descriptor:
-        pooled = pooled_descriptor(scan, options)
-        record["descriptor"] = np.round(pooled, DESCRIPTOR_DECIMALS).tolist()
+    if descriptors:
+        record["descriptors"] = _as_text(shorten(_point_descriptors(scan, options)))
     return record
+
+
+def _as_text(values: np.ndarray) -> str:
+    return base64.b64encode(values.tobytes()).decode("ascii")
 
 
 def sample_of(description: Mapping[str, Any]) -> np.ndarray:
@@ -127,11 +129,13 @@ def sample_of(description: Mapping[str, Any]) -> np.ndarray:
     return stored.astype(np.float64) + description["centroid"]
 
 
-def pooled_descriptor(scan: Scan, options: AlignOptions) -> np.ndarray:
-    """Return the mean and spread of a scan's point descriptors, before any pair is known -> (2 D,).
+def descriptors_of(description: Mapping[str, Any]) -> np.ndarray:
+    """Return what the network sees of a scan, (N, LENGTH) int8, from its description; see ``vocabulary``."""
+    return np.frombuffer(base64.b64decode(description["descriptors"]), np.int8).reshape(-1, LENGTH)
 
-    The network's descriptors don't depend on the pose, so neither does this.
-    """
+
+def _point_descriptors(scan: Scan, options: AlignOptions) -> np.ndarray:
+    """Return the descriptors (N, D) of a scan's sampled points, the same in any pose."""
     import torch
 
     from utopic_cli.bridge import cpu_threads, load_network, to_cloud_input
@@ -142,8 +146,7 @@ def pooled_descriptor(scan: Scan, options: AlignOptions) -> np.ndarray:
         prepared = prepare(scan.cloud, scan.cloud, options.points)
         cloud = to_cloud_input(prepared.source, prepared.spacing, model.config.neighbours)
         _, descriptors = model.extractor(cloud.to(next(model.parameters()).device))
-    each = descriptors[0].cpu().numpy().astype(np.float64)  # (N, D)
-    return np.concatenate([each.mean(axis=0), each.std(axis=0)])
+    return np.asarray(descriptors[0].cpu().numpy(), np.float64)
 
 
 def register(source: Scan, target: Scan, options: AlignOptions) -> dict[str, Any]:

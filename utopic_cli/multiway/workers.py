@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -16,13 +16,10 @@ from types import TracebackType
 from typing import Any
 
 from utopic_cli.errors import InputError
+from utopic_cli.threads import threads_of_children
 
 Task = Callable[[Any], dict[str, Any]]
 _Answer = tuple[dict[str, Any] | None, str | None, bool]  # result, problem, lasting
-
-# NumPy's and SciPy's linear algebra and torch heed one of these when they are loaded.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_STARTING = threading.Lock()  # the environment is the whole process', and a station has several threads
 
 
 START_LIMIT_S = 300.0
@@ -168,7 +165,7 @@ class Workers:
         process = self._context.Process(
             target=_serve, args=(theirs, self._make_task, os.getpid()), daemon=True
         )
-        with _thread_variables(self._threads):
+        with threads_of_children(self._threads):
             process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
         worker = _Worker(process, mine)
@@ -182,22 +179,6 @@ class Workers:
         if worker.process.is_alive():
             worker.process.kill()
         worker.process.join()
-
-
-@contextmanager
-def _thread_variables(threads: int) -> Iterator[None]:
-    """Let processes that are started meanwhile read how many threads to take; one at a time."""
-    with _STARTING:
-        before = {name: os.environ.get(name) for name in _THREADS}
-        os.environ.update(dict.fromkeys(_THREADS, str(threads)))
-        try:
-            yield
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
 
 
 def _obituary(exit_code: int | None) -> str:

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import html
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,12 +15,12 @@ from utopic_cli.io.colour import SOURCE_COLOUR, TARGET_COLOUR, colour_map
 from utopic_cli.io.transformation import CONVENTION, format_transformation
 from utopic_cli.page.charts import overlap_histogram, residual_histogram
 from utopic_cli.page.scene import MOST_RIVALS, Scene, build_scene, draw_clouds
+from utopic_cli.page.skeleton import resource, script_json, whole_page
 from utopic_cli.page.words import decimals, facts, length, rival_text, verdict
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import RegistrationResult
 
 MARKS = {"yes": "✓", "no": "✕", "none": "?"}
-_HERE = Path(__file__).parent
 _HASH = 12  # digits of the weights' hash that are shown; the rest is in its tooltip
 
 
@@ -75,14 +71,10 @@ def render(
     drawn = draw_clouds(result, source, target)
     scene = build_scene(result, *drawn, colormap)
     views = _views(result, source, scene)
-    script = _template("viewer.js")
+    script = resource(__package__, "viewer.js")
     said = verdict(result)
+    shown = [{"pose": one.pose, "values": one.values} for one in views]
     fills = {
-        "title": _text(f"{source_name} → {target_name}"),
-        # Nothing but this very script runs, and nothing is loaded, whatever a name may hold.
-        "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
-        "style": _template("page.css"),
-        "colours": _colours(colormap),
         "source_name": _text(source_name),
         "target_name": _text(target_name),
         "verdict": said.kind,
@@ -109,11 +101,12 @@ def render(
         "weights_hash": _text(result.weights_sha256),
         "weights_short": _text(result.weights_sha256[:_HASH]),
         "version": _text(__version__),
-        # A closing tag in here must not end the script element.
-        "scene": _json({**scene.data, "views": [{"pose": one.pose, "values": one.values} for one in views]}),
+        "scene": script_json({**scene.data, "views": shown}),
         "script": script,
     }
-    return _filled(_template("align.html"), fills)
+    title = _text(f"{source_name} → {target_name} · utopic")
+    style = f"{_colours(colormap)}\n{resource(__package__, 'page.css')}"
+    return whole_page(title, style, resource(__package__, "align.html"), fills, only_script=script)
 
 
 def _views(result: RegistrationResult, source: PointCloud, scene: Scene) -> list[View]:
@@ -221,21 +214,3 @@ def _rows(items: Iterable[tuple[str, Any]]) -> str:
 def _text(value: Any) -> str:
     """Return any text as HTML; bytes of a file name that are no text become question marks."""
     return html.escape(str(value).encode("utf-8", "replace").decode("utf-8"))
-
-
-def _json(data: Any) -> str:
-    return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-def _template(name: str) -> str:
-    return (_HERE / name).read_text(encoding="utf-8")
-
-
-def _filled(template: str, fills: Mapping[str, str]) -> str:
-    """Put each fill where the template has its name in double braces; fills are not looked into."""
-    pieces = template.split("{{")
-    page = [pieces[0]]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        page += [fills[name], rest]
-    return "".join(page)

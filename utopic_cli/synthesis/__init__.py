@@ -5,7 +5,7 @@ is sampled densely, stretched and warped into something organic, seen by a virtu
 scanner from two sides, thinned, disturbed and moved by two random rigid motions.
 
 - ``shapes``: libraries of triangle meshes; ``packing``: opens or makes one from what a user names
-  (``shape_files``, ``mesh_form``, ``reconstruction`` of clouds, ``modelnet40``).
+  (``shape_files``, ``mesh_form``, ``reconstruction`` of clouds, ``modelnet40``; kept in ``shape_cache``).
 - ``procedural``, its ``families`` and ``implicit`` solids: meshes made here.
 - ``surface``, ``warp``: a mesh as a dense sample; smooth deformations of it.
 - ``scanner``: what a range scanner sees of it. ``crops``: the paper's way to cut it.

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import os
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -16,13 +14,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from utopic_cli.errors import InputError, OutputError
-from utopic_cli.io.output import check_writable, write_atomically
+from utopic_cli.errors import InputError
 from utopic_cli.synthesis.hdf5_clouds import CloudSet
 from utopic_cli.synthesis.mesh_form import PackedMesh, packed_mesh
 from utopic_cli.synthesis.modelnet40 import find_modelnet40, read_modelnet40
 from utopic_cli.synthesis.reconstruction import mesh_from_points
 from utopic_cli.synthesis.scanobjectnn import find_scanobjectnn, read_scanobjectnn
+from utopic_cli.synthesis.shape_cache import cached
 from utopic_cli.synthesis.shape_files import (
     CLOUD_SUFFIXES,
     MESH_SUFFIXES,
@@ -42,7 +40,6 @@ SCANOBJECTNN = "scanobjectnn:"
 
 Progress = Callable[[int, int, str], None]
 Item = TypeVar("Item")
-_FORM = 1  # part of a cached pack's name: raise it when what is packed changes
 _POOL_FROM = 100  # fewer shapes are not worth starting processes for
 _VALIDATION_SHARE = 10  # one shape of so many, by its name
 
@@ -80,11 +77,11 @@ def open_shapes(data: str, *, progress: Progress | None = None) -> ShapeLibrary:
     if data.startswith(MODELNET40):
         root = _folder(data.removeprefix(MODELNET40))
         parts = find_modelnet40(root)
-        return _cached(root, MODELNET40, parts, lambda: _pack_clouds(root, read_modelnet40(root), progress))
+        return cached(root, MODELNET40, parts, lambda: _pack_clouds(root, read_modelnet40(root), progress))
     if data.startswith(SCANOBJECTNN):
         file = find_scanobjectnn(Path(data.removeprefix(SCANOBJECTNN)))
         kind = SCANOBJECTNN + file.name  # several such files may lie in one folder
-        return _cached(
+        return cached(
             file.parent, kind, [file], lambda: _pack_clouds(file.parent, read_scanobjectnn(file), progress)
         )
     if Path(data).is_file() and Path(data).suffix.lower() != ".npz":
@@ -99,7 +96,7 @@ def open_shapes(data: str, *, progress: Progress | None = None) -> ShapeLibrary:
             f"{' '.join(MESH_SUFFIXES + CLOUD_SUFFIXES)}; download some (Objaverse, Thingi10K, ModelNet), "
             f"or use '{PROCEDURAL}'"
         )
-    return _cached(root, "files", files, lambda: _pack_files(root, files, progress))
+    return cached(root, "files", files, lambda: _pack_files(root, files, progress))
 
 
 def describe_data(data: str) -> str:
@@ -127,64 +124,11 @@ def describe_skipped(library: ShapeLibrary, most: int = 3) -> str | None:
     return f"skipped {count} shape{'s' if count > 1 else ''}: {named}{rest}{notes}"
 
 
-def cache_folder() -> Path:
-    """Return where packed shapes are kept: ``utopic`` in the user's cache."""
-    if sys.platform == "win32":
-        local = os.environ.get("LOCALAPPDATA")
-        return (Path(local) if local else Path.home() / "AppData" / "Local") / "utopic"
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(given) if os.path.isabs(given) else Path.home() / ".cache") / "utopic"
-
-
 def _folder(name: str) -> Path:
     root = Path(name)
     if not root.is_dir():
         raise InputError(f"{name}: no such folder of shapes; check the path")
     return root
-
-
-# The cache ---------------------------------------------------------------------------------
-
-
-def _cached(
-    root: Path, kind: str, files: Sequence[Path], build: Callable[[], dict[str, np.ndarray]]
-) -> ShapeLibrary:
-    """Return the pack of some files of a folder, built if the cache has none or a damaged one."""
-    place = hashlib.sha1(kind.encode() + os.fsencode(root.resolve())).hexdigest()[:16]
-    content = hashlib.sha1(f"form {_FORM}".encode())
-    for file in files:
-        try:
-            found = file.stat()
-            line = (os.fsencode(file.relative_to(root)), found.st_size, found.st_mtime_ns)
-        except OSError:  # a broken link, say: packing will name it
-            line = (os.fsencode(file.relative_to(root)), -1, -1)
-        content.update(repr(line).encode())
-    pack = cache_folder() / f"{place}-{content.hexdigest()[:16]}.npz"
-    if pack.exists():
-        with contextlib.suppress(InputError):
-            return load_shapes(pack)
-    _prepare_cache(pack)
-    arrays = build()
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-    write_atomically(pack, stream.getvalue(), overwrite=True)
-    for old in pack.parent.glob(f"{place}-*.npz"):
-        if old != pack:  # what this folder held before
-            with contextlib.suppress(OSError):
-                old.unlink()
-    return load_shapes(pack)
-
-
-def _prepare_cache(pack: Path) -> None:
-    """Make sure, before minutes of work, that its result can be kept."""
-    advice = "shapes are packed there; set XDG_CACHE_HOME to a folder that can be written"
-    try:
-        pack.parent.mkdir(parents=True, exist_ok=True)
-        check_writable([pack], overwrite=True)
-    except OSError as error:
-        raise OutputError(f"{pack.parent}: can't be made ({error.strerror}); {advice}") from error
-    except OutputError as error:
-        raise OutputError(f"{error} ({advice})") from error
 
 
 # What is packed ----------------------------------------------------------------------------

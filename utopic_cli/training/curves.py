@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import html
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from datetime import datetime
 from typing import Any
 
+from utopic_cli.page.skeleton import resource, script_json, whole_page
 from utopic_cli.training.network import LossWeights
 
 MOST_POINTS = 1500
@@ -61,7 +61,13 @@ def label_of(name: str) -> str:
     return LABELS.get(name, name.replace("_", " "))
 
 
-def curves_page(records: Sequence[Mapping[str, Any]], title: str, settings: Mapping[str, Any]) -> str:
+def curves_page(
+    records: Sequence[Mapping[str, Any]],
+    title: str,
+    settings: Mapping[str, Any],
+    *,
+    now: datetime | None = None,
+) -> str:
     """Draw the curves of a run.
 
     Args:
@@ -69,6 +75,8 @@ def curves_page(records: Sequence[Mapping[str, Any]], title: str, settings: Mapp
             ``elapsed_s`` (seconds), loss terms, speeds, and validation metrics now and then.
         title: name of the run.
         settings: sections of settings, as ``TrainingConfig.as_dict`` gives them.
+        now: when the last record was made, while the run goes on: the page stays as it is, so the
+            time left is said as of then. Of a run that ended (None) no time is left.
 
     Returns:
         One HTML page that loads nothing from elsewhere, under 1 MB for a run of any length.
@@ -86,20 +94,15 @@ def curves_page(records: Sequence[Mapping[str, Any]], title: str, settings: Mapp
     last = records[-1] if records else {}
     fills = {
         "title": html.escape(title),
-        "summary": html.escape(_summary(last)),
+        "summary": html.escape(_summary(last, now)),
         "percent": f"{100 * last['pairs'] / max(last['of'], 1):.1f}" if last else "0",
         "rows": "\n".join(_row(name, records) for kind in TABLE for name in names[kind]),
         "settings": "\n".join(_setting_rows(settings)),
         "note": html.escape(_note(len(records))),
-        # A closing tag inside a name must not end the script element.
-        "data": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "data": script_json(data),
     }
-    pieces = (Path(__file__).parent / "curves.html").read_text(encoding="utf-8").split("{{")
-    page = pieces[0]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        page += fills[name] + rest
-    return page
+    style, body = resource(__package__, "curves.css"), resource(__package__, "curves.html")
+    return whole_page(f"{fills['title']} · training curves", style, body, fills)
 
 
 def _names(records: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
@@ -188,13 +191,15 @@ def _chart(names: Sequence[str], table: str) -> dict[str, Any]:
     }
 
 
-def _summary(last: Mapping[str, Any]) -> str:
+def _summary(last: Mapping[str, Any], now: datetime | None) -> str:
     if not last:
         return "No record yet."
     taken = _duration(last["elapsed_s"])
     text = f"{last['pairs']:,} of {last['of']:,} pairs in {taken}, {last['stage']} stage"
     left = _number(last.get("left_s"))
-    return f"{text}, about {_duration(left)} left" if left else text
+    if now is None or not left:
+        return text
+    return f"{text}, about {_duration(left)} left as of {now.isoformat(' ', 'minutes')}"
 
 
 def _duration(seconds: float) -> str:

@@ -7,6 +7,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -90,7 +91,7 @@ class Journal:
         self._write_events(record)
         # The first page comes with the first record, so that there is something to open.
         if len(self.records) == 1 or time.monotonic() - self._paged >= SECONDS_BETWEEN_PAGES:
-            self._write_page()
+            self._write_page(datetime.now().astimezone())
 
     def close(self) -> None:
         """Write the last page and close all files; may be called twice."""
@@ -105,7 +106,7 @@ class Journal:
                 self._events.close()
             except OSError as error:
                 log.warning("%s: can't be written (%s)", self._out / EVENTS, error.strerror)
-        self._write_page()
+        self._write_page(None)
 
     def _write_events(self, record: Mapping[str, Any]) -> None:
         if self._events is None:
@@ -120,9 +121,9 @@ class Journal:
             log.warning("%s: can't be written (%s); no more events", self._out / EVENTS, error.strerror)
             self._events = None
 
-    def _write_page(self) -> None:
+    def _write_page(self, now: datetime | None) -> None:
         self._paged = time.monotonic()
-        page = curves_page(self.records, self._out.absolute().name, self._settings)
+        page = curves_page(self.records, self._out.absolute().name, self._settings, now=now)
         try:
             write_atomically(self._out / PAGE, page.encode("utf-8"), overwrite=True)
         except OutputError as error:
