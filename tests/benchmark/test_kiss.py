@@ -52,6 +52,19 @@ def test_registers_an_easy_pair_and_gets_the_same_refinement(views: ScanPair, tm
 
 
 @forks
+def test_answers_although_torch_has_used_several_threads_before(views: ScanPair) -> None:
+    import torch
+
+    pytest.importorskip("kiss_matcher")
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    torch.rand(1000, 1000).exp().sum()  # OpenMP now has a second thread, which no fork takes along
+    torch.set_num_threads(before)
+    case = trial(views.source.points[::8], views.source.points[1::8])
+    assert is_rigid(KissMatcher(patience_s=60.0).estimate(case), 1e-4)
+
+
+@forks
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_the_unit_and_the_place_do_not_matter(views: ScanPair, scale: float) -> None:
     pytest.importorskip("kiss_matcher")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import multiprocessing
 import signal
+import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
@@ -132,10 +133,18 @@ def answer_of_child(work: Callable[[], Answer | None], patience_s: float) -> Ans
 
 def _send_answer(work: Callable[[], Answer | None], there: Connection) -> None:
     faulthandler.disable()  # a crash is told in the parent, in one line
-    try:
-        there.send((work(), None))
-    except Exception as error:  # whatever it raises is told in the parent
-        there.send((None, f"{type(error).__name__}: {error}"))
+
+    def answer() -> None:
+        try:
+            there.send((work(), None))
+        except Exception as error:  # whatever it raises is told in the parent
+            there.send((None, f"{type(error).__name__}: {error}"))
+
+    # Where the parent has used OpenMP, the thread that was forked would wait for ever for its other
+    # threads, which were not. A new one brings its own.
+    thread = threading.Thread(target=answer)
+    thread.start()
+    thread.join()
 
 
 def _how_it_ended(exitcode: int | None) -> str:
