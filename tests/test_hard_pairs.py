@@ -138,5 +138,5 @@ def test_millimetres_against_metres_are_refused(larger: str) -> None:
     assert "bring both to the same unit" in message
     named = re.search(r"sizes differ by a factor of about ([0-9.e+]+)", message)
     extents = {name: float(np.linalg.norm(np.ptp(cloud.points, axis=0))) for name, cloud in clouds.items()}
-    assert named is not None
+    assert named is not None and f"the {larger} is the larger, " in message
     assert float(named[1]) == pytest.approx(max(extents.values()) / min(extents.values()), rel=0.01)

@@ -16,6 +16,7 @@ from utopic_cli.io.ply_writer import scalar_cloud_ply
 from utopic_cli.pipeline import register
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.synthesis.demo_object import demo_pair
+from utopic_cli.verdict import SAME_POINTS
 
 OPTIONS = AlignOptions(points=400)
 
@@ -203,6 +204,7 @@ def test_places_that_are_there_fifty_times_are_taken_once(pair):
     places = rng.standard_normal((60, 3))
     merged = PointCloud(np.repeat(places, 50, axis=0))
     found = register(merged, merged, OPTIONS)
+    assert any(SAME_POINTS in reason for reason in found.reasons)
     assert rigid.is_rigid(found.T_target_source, 1e-9)
 
 
@@ -239,14 +241,30 @@ def test_scans_of_very_different_size_are_named(pair):
     ("points", "message"),
     [
         (np.zeros((100, 2)), r"source: an array of shape \(100, 2\); expected \(N, 3\)"),
-        (np.zeros((100, 3)), "source: all of its 100 points are equal"),
-        (np.full((100, 3), np.nan), "source: none of its 100 points is finite"),
+        (np.zeros((100, 3)), "source: all of its 100 points are equal; check what"),
+        (np.full((100, 3), np.nan), r"source: none of its 100 points is finite; check what"),
+        (np.full((100, 3), 1e200), r"source: has coordinates beyond 1e100.*; check what"),
         (np.outer(np.arange(100.0), [1, 2, 3]), "source: all of its points lie on a line"),
-        (None, "source: a NoneType that is neither a path nor"),
-        (np.ones((100, 3)).astype(str), "source: a ndarray that is neither a path nor"),
-        (np.ones((100, 3), complex), "source: a ndarray that is neither a path nor"),
+        (None, r"source: is None; give a path or an \(N, 3\) array"),
+        (np.ones((100, 3)).astype(str), "source: holds text, not numbers; give a path"),
+        ([["a", "b", "c"]] * 60, "source: holds text, not numbers"),
+        (np.ones((100, 3), complex), "source: holds complex numbers; give"),
+        (PointCloud(np.ones((100, 3))), r"source: is a PointCloud, .*pass numpy\.asarray\(cloud\.points\)"),
+        ({}, "source: is neither a path nor real numbers, but of type dict"),
     ],
-    ids=["two columns", "all equal", "all NaN", "a line", "nothing", "words", "complex"],
+    ids=[
+        "two columns",
+        "all equal",
+        "all NaN",
+        "huge",
+        "a line",
+        "nothing",
+        "words",
+        "a list of words",
+        "complex",
+        "a cloud",
+        "a dict",
+    ],
 )
 def test_arrays_that_cannot_be_used_are_explained(pair, points, message):
     with pytest.raises(InputError, match=message):

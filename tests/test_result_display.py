@@ -49,22 +49,33 @@ class Tags(HTMLParser):
 
 def test_repr_is_a_line_about_the_answer_not_its_arrays(result: RegistrationResult) -> None:
     assert repr(result) == (
-        "<RegistrationResult: 60 -> 80 points, trusted=True, confidence=0.970,"
+        "<RegistrationResult: aligned and trusted, confidence=0.970, 60 -> 80 points,"
         " turned by 90.000 degrees, rivals: 0>"
     )
-    assert "confidence=None" in repr(replace(result, confidence=None))
+    unknown = repr(replace(result, confidence=None, trusted=False))
+    assert "confidence=None" in unknown and "aligned, not trusted" in unknown
 
 
 def test_a_notebook_shows_verdict_reasons_and_matrix(result: RegistrationResult) -> None:
     page = Tags(result._repr_html_())
     assert not page.open and page.names <= {"div", "b", "ul", "li", "pre", "code"}
-    assert "aligned; confidence 97%" in page.text and "the surfaces agree" in page.text
+    assert "aligned and trusted; confidence 97%" in page.text and "the surfaces agree" in page.text
     matrix = page.text.partition("T_target_source")[2].split()
     rows = np.reshape([float(value) for value in matrix], (4, 4))
     np.testing.assert_array_equal(rows, result.T_target_source)
     doubted = replace(result, trusted=False, confidence=0.2, ambiguous_with=(np.eye(4),), warnings=("odd",))
     text = Tags(doubted._repr_html_()).text
     assert "do not trust it" in text and "rivals 1, see ambiguous_with" in text and "odd" in text
+
+
+def test_a_notebook_shows_six_digits_and_no_rounding(result: RegistrationResult) -> None:
+    turned = result.T_target_source.copy()
+    turned[0, 0], turned[1, 1], turned[0, 3] = -1e-17, 0.123456789, 1234.56789
+    fit = replace(result.fit, inlier_rmse=1.2e-17)
+    text = Tags(replace(result, T_target_source=turned, fit=fit)._repr_html_()).text
+    matrix = text.partition("T_target_source")[2].split()
+    assert matrix[5] == "0.123457" and matrix[3] == "1234.57" and float(matrix[0]) == 0.0
+    assert "residual 0 file units" in text
 
 
 def test_words_from_outside_are_escaped(result: RegistrationResult) -> None:
@@ -76,7 +87,7 @@ def test_words_from_outside_are_escaped(result: RegistrationResult) -> None:
 @pytest.mark.parametrize(
     ("confidence", "trusted", "said"),
     [
-        (0.999, True, "aligned; confidence over 99%"),
+        (0.999, True, "aligned and trusted; confidence over 99%"),
         (0.5, False, "aligned, but do not trust it; confidence 50%"),
         (None, False, "aligned, but nothing says how well: do not trust it unseen"),
     ],

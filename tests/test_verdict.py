@@ -12,7 +12,15 @@ from utopic_cli.estimation.confidence import Calibration
 from utopic_cli.estimation.evidence import SAME
 from utopic_cli.geometry import rigid
 from utopic_cli.result import FreeMotion, Observability
-from utopic_cli.verdict import UNCALIBRATED, UNUSUAL, Verdict, judge, motion_in_words, read_calibration
+from utopic_cli.verdict import (
+    SAME_POINTS,
+    UNCALIBRATED,
+    UNUSUAL,
+    Verdict,
+    judge,
+    motion_in_words,
+    read_calibration,
+)
 
 GOOD = {
     "likeness": 1.0,
@@ -113,8 +121,16 @@ def test_a_rival_that_is_only_shifted_is_named_so() -> None:
 
 def test_sizes_that_differ_come_first() -> None:
     ratio = {"source": 0.7, "target": 0.02}
-    found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, size_ratio=12.0)
-    assert found.reasons[0] == "the scans' sizes differ by a factor of about 12: are both in the same unit?"
+    found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, sizes=(2.0, 24.0))
+    assert found.reasons[0] == (
+        "the scans' sizes differ by a factor of about 12 (the target is the larger, 24 against 2 file units)"
+        ": are both in the same unit?"
+    )
+
+
+def test_a_scan_named_twice_is_told_and_stays_trusted() -> None:
+    found = judge(calibration(), GOOD, np.eye(4), (), FIXED, {"source": 1.0, "target": 1.0}, same=True)
+    assert found.trusted and found.reasons[1] == f"but {SAME_POINTS}"
 
 
 def test_an_answer_found_another_way_than_the_calibrations_has_no_verdict() -> None:

@@ -38,6 +38,13 @@ from utopic_cli.io.files import printable
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
 _PASSED_ON = (typer.Exit, typer.Abort)
 
+_MEANT = {
+    ("batch", "-o"): "--out-dir",
+    ("batch", "--output"): "--out-dir",
+    ("transformation", "--to"): "--form",
+}
+"""What a command has in the place of an option that it doesn't have."""
+
 _ALIGN = "Align scans"
 _FIRST = "First steps"
 _OWN = "Weights of your own"
@@ -60,6 +67,9 @@ class Door(TyperGroup):
                 raise
             command = error.ctx.command_path if error.ctx else "utopic"
             what = _one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
+            option = getattr(error, "option_name", "")
+            meant = _MEANT.get((str(error.ctx and error.ctx.info_name), option))
+            what = f"No such option: {option}; did you mean {meant}?" if meant else what
             _leave(ctx, f"error: {what}; see '{command} --help'", 2)
         except KeyboardInterrupt:
             _leave(ctx, "interrupted", 130)

@@ -78,7 +78,7 @@ def find_frame(source: PointCloud, target: PointCloud, points: int, *, clean: bo
             for part, tree in zip(thinned, trees, strict=True)
         ]
     spacing = _common_spacing(thinned, points)
-    _check_sizes(thinned, spacing)
+    _check_sizes(thinned, spacing, scale)
     return Frame(normalised, trees, tuple(thinned), (centres[0], centres[1]), scale, spacing, points)
 
 
@@ -111,21 +111,38 @@ def _common_spacing(clouds: list[np.ndarray], most: int) -> float:
     )
 
 
-def _check_sizes(clouds: list[np.ndarray], spacing: float) -> None:
+def _check_sizes(clouds: list[np.ndarray], spacing: float, scale: float) -> None:
     """Refuse a pair whose smaller scan is but a dot beside the larger one."""
     if min(voxel_index(points, spacing / DENSE_RATIO)[1] for points in clouds) >= FEWEST_DENSE_POINTS:
         return
-    ratio = size_ratio(*clouds)
+    source, target = (scale * extent(points) for points in clouds)
     raise InputError(
-        f"the scans' sizes differ by a factor of about {ratio:.3g}: "
-        f"bring both to the same unit{units_in_words(ratio)}"
+        f"{sizes_in_words(source, target)}: "
+        f"bring both to the same unit{units_in_words(size_ratio(source, target))}"
     )
 
 
-def size_ratio(source: np.ndarray, target: np.ndarray) -> float:
-    """Return the extent of the larger cloud over that of the smaller one, points astray left out."""
-    extents = [float(np.linalg.norm(np.ptp(points[~astray(points)], axis=0))) for points in (source, target)]
-    return max(extents) / max(min(extents), 1e-300)
+def extent(points: np.ndarray) -> float:
+    """Return the diagonal of a cloud's bounding box, points astray left out."""
+    return float(np.linalg.norm(np.ptp(points[~astray(points)], axis=0)))
+
+
+def size_ratio(source: float, target: float) -> float:
+    """Return the larger of two extents over the smaller one."""
+    return max(source, target) / max(min(source, target), 1e-300)
+
+
+def sizes_in_words(source: float, target: float) -> str:
+    """Say that two scans' extents differ: by which factor, which is the larger, and both."""
+    larger, low, high = "target", source, target
+    if source > target:
+        larger, low, high = "source", target, source
+    ratio = size_ratio(source, target)
+    factor = f"{ratio:.0f}" if ratio < 1e5 else f"{ratio:.3g}"
+    return (
+        f"the scans' sizes differ by a factor of about {factor} "
+        f"(the {larger} is the larger, {high:.4g} against {low:.4g} file units)"
+    )
 
 
 def units_in_words(ratio: float) -> str:

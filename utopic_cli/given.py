@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -64,7 +65,7 @@ def take(scan: str | PathLike[str] | ArrayLike, name: str, seed: int) -> Given:
     dropped = len(points) - len(kept)
     finite = points[kept] if dropped else points
     try:
-        check_points(finite, len(points))
+        check_points(finite, len(points), remedy="check what was put into the array")
     except FormatError as error:
         raise InputError(f"{name}: {error}") from error
     said = (f"{name}: {dropped} of {len(points)} points are NaN or infinite and were left out",)
@@ -86,6 +87,7 @@ def as_given(result: RegistrationResult, source: Given, target: Given) -> Regist
             target_indices=target.kept[pairs.target_indices],
         ),
         warnings=(*result.warnings, *source.warnings, *target.warnings),
+        _digests=(_digest(source), _digest(target)),
     )
 
 
@@ -124,16 +126,21 @@ def as_read(result: RegistrationResult, source: Scan, target: Scan) -> Registrat
     """Return a result of ``as_given`` whose arrays and indices are those of the scans' points again.
 
     Raises:
-        UsageError: the scans have other numbers of points than those that were aligned.
+        UsageError: the scans' points are not those that were aligned.
     """
     changes: dict[str, Any] = {}
     pairs = result.correspondences
     said: set[str] = set()
-    for name, scan in (("source", source), ("target", target)):
+    for side, (name, scan) in enumerate((("source", source), ("target", target))):
         values = [getattr(result, f"{name}_{field}") for field in ("overlap", "uncertainty")]
         if len(values[0]) != scan.records:
             raise UsageError(
                 f"{scan.path}: has {scan.records} points, the result's {name} {len(values[0])};"
+                " give the scans that were aligned, source first"
+            )
+        if result._digests and result._digests[side] != _digest(scan):
+            raise UsageError(
+                f"{scan.path}: its points are not those of the result's {name};"
                 " give the scans that were aligned, source first"
             )
         changes |= {f"{name}_overlap": values[0][scan.kept], f"{name}_uncertainty": values[1][scan.kept]}
@@ -144,17 +151,38 @@ def as_read(result: RegistrationResult, source: Scan, target: Scan) -> Registrat
     return replace(result, **changes, correspondences=pairs, warnings=kept)
 
 
+def _digest(scan: Given | Scan) -> str:
+    """Return a hash of the finite points and their places: the same for a file and its array."""
+    digest = hashlib.sha256(scan.kept.astype("<i8").data)
+    digest.update(np.ascontiguousarray(scan.cloud.points + 0.0, "<f8").data)  # -0 is 0
+    return digest.hexdigest()
+
+
 def _numbers(scan: Any, name: str) -> np.ndarray:
     """Return real numbers (N, 3) as float64."""
+    kind = ""
     try:
         given = np.asarray(scan)
-        points = given.astype(np.float64) if given.dtype.kind in "fiub" else None
+        kind = given.dtype.kind
+        points = given.astype(np.float64) if kind in "fiub" else None
     except (TypeError, ValueError):
         points = None
     if points is None:
-        raise InputError(
-            f"{name}: a {type(scan).__name__} that is neither a path nor an (N, 3) array of real numbers"
-        )
+        raise InputError(f"{name}: {_no_numbers(scan, kind)}")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name}: an array of shape {points.shape}; expected (N, 3)")
     return points
+
+
+def _no_numbers(scan: Any, kind: str) -> str:
+    """Say what was given instead of a path or numbers, and what to give."""
+    wanted = "give a path or an (N, 3) array of real numbers"
+    if scan is None:
+        return f"is None; {wanted}"
+    if hasattr(scan, "points"):  # Open3D's clouds, PyVista's
+        return f"is a {type(scan).__name__}, not an array; pass numpy.asarray(cloud.points)"
+    if kind in ("U", "S"):
+        return f"holds text, not numbers; {wanted}"
+    if kind == "c":
+        return f"holds complex numbers; {wanted}"
+    return f"is neither a path nor real numbers, but of type {type(scan).__name__}; {wanted}"

@@ -20,7 +20,7 @@ from utopic_cli.estimation.problem import working_voxel
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.surface import make_surface, point_spacing
 from utopic_cli.estimation.verification import measure_fit
-from utopic_cli.frame import find_frame, size_ratio
+from utopic_cli.frame import extent, find_frame
 from utopic_cli.geometry import rigid
 from utopic_cli.given import as_given, take
 from utopic_cli.look import look, look_both_sides
@@ -183,7 +183,6 @@ def _register(
         view.target_overlap,
         view.target_uncertainty,
     )
-    sizes = size_ratio(source.points, target.points)
     verdict = judge(
         calibration,
         signals,
@@ -191,9 +190,10 @@ def _register(
         rivals,
         observability,
         fit.overlap_ratio,
-        sizes,
+        (extent(source.points), extent(target.points)),
         # Only "auto" looks for all the rivals, and unrefined surfaces agree less.
         usual=options.solver == "auto" and options.refine,
+        same=np.array_equal(source.points, target.points),
     )
     return RegistrationResult(
         T_target_source=transformation,

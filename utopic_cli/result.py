@@ -116,6 +116,7 @@ class RegistrationResult:
         weights_name: name of the network weights used.
         weights_sha256: hash of the weights file.
         options: the resolved options of this run.
+        _digests: of the points that ``align`` was given, source first, so that ``save`` can tell others.
     """
 
     T_target_source: np.ndarray
@@ -137,6 +138,7 @@ class RegistrationResult:
     weights_name: str = ""
     weights_sha256: str = ""
     options: dict[str, Any] = field(default_factory=dict)
+    _digests: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         return one_line(self)

@@ -8,8 +8,10 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from utopic_cli.result import RegistrationResult
+    from utopic_cli.result import FitMeasures, RegistrationResult
 
+TRUSTED = "aligned and trusted"
+ROUNDING = 1e-12  # of the size: lengths below it are what float64 leaves of 0
 _SURE = 0.99
 # Beside a coloured edge the notebook's own colours: they fit its light or dark page.
 _STYLE = "border-left:4px solid {edge};padding:.2em 0 .2em .8em;max-width:60em"
@@ -20,7 +22,7 @@ def headline(result: RegistrationResult) -> str:
     """Return the verdict in a line."""
     if result.confidence is None:
         return "aligned, but nothing says how well: do not trust it unseen"
-    verdict = "aligned" if result.trusted else "aligned, but do not trust it"
+    verdict = TRUSTED if result.trusted else "aligned, but do not trust it"
     # Never "100%": it is an estimate.
     said = "over 99%" if result.confidence > _SURE else f"{result.confidence:.0%}"
     return f"{verdict}; confidence {said}"
@@ -29,9 +31,10 @@ def headline(result: RegistrationResult) -> str:
 def one_line(result: RegistrationResult) -> str:
     """Return what ``repr`` shows: the verdict and the motion, not the arrays."""
     confidence = "None" if result.confidence is None else f"{result.confidence:.3f}"
+    verdict = TRUSTED if result.trusted else "aligned, not trusted"
     points = f"{len(result.source_overlap)} -> {len(result.target_overlap)} points"
     return (
-        f"<RegistrationResult: {points}, trusted={result.trusted}, confidence={confidence}, "
+        f"<RegistrationResult: {verdict}, confidence={confidence}, {points}, "
         f"turned by {_angle_deg(result):.3f} degrees, rivals: {len(result.ambiguous_with)}>"
     )
 
@@ -45,11 +48,12 @@ def as_html(result: RegistrationResult) -> str:
         ("turned by", f"{_angle_deg(result):.3f}°"),
     ]
     if math.isfinite(fit.inlier_rmse):
-        rows.insert(1, ("residual", f"{fit.inlier_rmse:.4g} file units rms where they overlap"))
+        rows.insert(1, ("residual", residual_in_words(fit)))
     if result.ambiguous_with:
         rows.append(("rivals", f"{len(result.ambiguous_with)}, see ambiguous_with"))
     matrix = "\n".join(
-        "  ".join(f"{value:>16.10g}" for value in row) for row in result.T_target_source.tolist()
+        "  ".join([*(f"{value + 0.0:9.6f}" for value in row[:3]), f"{row[3]:>12.6g}"])
+        for row in result.T_target_source.tolist()
     )
     facts = "".join(f"<div><b>{name}</b> {html.escape(text)}</div>" for name, text in rows)
     return (
@@ -57,6 +61,16 @@ def as_html(result: RegistrationResult) -> str:
         f"<div><b>{html.escape(headline(result))}</b></div>{_list(result.reasons)}{facts}"
         f"<div><code>T_target_source</code></div><pre>{matrix}</pre>{_list(result.warnings)}</div>"
     )
+
+
+def residual_in_words(fit: FitMeasures) -> str:
+    """Say how far the scans lie from each other; the threshold is about a hundredth of their size."""
+    return f"{rounded(fit.inlier_rmse, 100 * fit.threshold):.4g} file units rms where they overlap"
+
+
+def rounded(length: float, size: float) -> float:
+    """Return a length, or 0 where it is but rounding in scans of such a size."""
+    return length if length > ROUNDING * size else 0.0
 
 
 def _list(texts: Iterable[str]) -> str:

@@ -13,11 +13,14 @@ from utopic_cli.estimation.candidates import LEAST_SUPPORT
 from utopic_cli.estimation.confidence import Calibration
 from utopic_cli.estimation.evidence import Evidence
 from utopic_cli.estimation.observability import DISPLACED, FREE
+from utopic_cli.frame import size_ratio, sizes_in_words
 from utopic_cli.geometry.rigid import relative_rotation_error_deg
 from utopic_cli.result import FreeMotion, Observability
 
 UNCALIBRATED = "these weights carry no calibration, so nothing says how far to trust them: look at the result"
 UNUSUAL = "confidence is calibrated for the default solver with refinement only: look at the result"
+
+SAME_POINTS = "both scans hold the same points: is one of them named twice?"
 
 UNIT_MISMATCH = 8.0
 """Extents that differ by more than this factor are named as a likely mix-up of units."""
@@ -104,8 +107,9 @@ def judge(
     rivals: Sequence[np.ndarray],
     observability: Observability | None,
     overlap_ratio: dict[str, float],
-    size_ratio: float = 1.0,
+    sizes: tuple[float, float] = (1.0, 1.0),
     usual: bool = True,
+    same: bool = False,
 ) -> Verdict:
     """Weigh the signals.
 
@@ -116,12 +120,15 @@ def judge(
         rivals: (4, 4) transformations that fit nearly as well.
         observability: which motions the overlap fixes.
         overlap_ratio: share of points with a counterpart, keys ``source`` and ``target``.
-        size_ratio: extent of the larger scan over that of the smaller one.
+        sizes: extents of source and target, file units.
         usual: whether the answer came about as those did that the calibration was fitted on.
+        same: whether both scans hold the same points.
     """
     doubts = _doubts(signals, transformation, rivals, observability, overlap_ratio)
-    if size_ratio >= UNIT_MISMATCH:
-        doubts.insert(0, size_in_words(size_ratio))
+    if size_ratio(*sizes) >= UNIT_MISMATCH:
+        doubts.insert(0, f"{sizes_in_words(*sizes)}: are both in the same unit?")
+    if same:
+        doubts.insert(0, SAME_POINTS)
     if calibration is None or not usual:
         return Verdict(None, False, (UNCALIBRATED if calibration is None else UNUSUAL, *doubts))
     confidence = calibration.probability(signals)
@@ -188,11 +195,6 @@ def _doubts(
         few = f"only {share:.1%}" if share > LEAST_SUPPORT else f"less than {LEAST_SUPPORT:.1%}"
         doubts.append(f"the answer explains {few} of what the network matched")
     return doubts
-
-
-def size_in_words(ratio: float) -> str:
-    """Say that two scans' sizes differ by a factor, and what that may mean."""
-    return f"the scans' sizes differ by a factor of about {ratio:.0f}: are both in the same unit?"
 
 
 def motion_in_words(motion: FreeMotion) -> str:

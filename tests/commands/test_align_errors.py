@@ -10,7 +10,8 @@ import pytest
 
 from utopic_cli.commands import outputs
 from utopic_cli.commands.console import to_stdout
-from utopic_cli.errors import OutputError
+from utopic_cli.errors import InputError, OutputError
+from utopic_cli.result import FitMeasures
 
 HEADER = (
     "ply\nformat ascii 1.0\nelement vertex {}\n"
@@ -336,11 +337,23 @@ def test_a_missing_file_of_no_known_kind_is_called_missing(cli, fake, scans):
     assert_one_line(result, "no such file")
 
 
-def test_the_same_bytes_twice_are_a_warning(cli, fake, scans, tmp_path):
-    result = cli("align", scans[0], scans[0], "--report", tmp_path / "r.json")
-    assert result.exit_code == 0 and "both files hold the same bytes" in result.stderr
-    assert "both files hold the same bytes" in (tmp_path / "r.json").read_text()
-    assert "the same bytes" not in cli("align", *scans).stderr
+def test_above_an_error_in_a_pipe_stands_no_step(cli, fake, scans, monkeypatch):
+    monkeypatch.setattr("utopic_cli.commands.console.SECONDS_BETWEEN_LINES", 0.0)
+    fake.raises = InputError("a.ply: nothing follows from it")
+    result = cli("align", *scans)
+    assert result.exit_code == 4
+    assert_one_line(result, "nothing follows from it")
+
+
+def test_lengths_that_are_but_rounding_are_said_to_be_0(cli, fake, scans):
+    near = np.eye(4)
+    near[:3, 3] = 1e-17
+    fake.changes = {
+        "T_target_source": near,
+        "fit": FitMeasures({"source": 1.0, "target": 1.0}, 1.0, 3e-17, {}, 0.1),
+    }
+    said = cli("align", *scans).stderr
+    assert "residual 0 file units" in said and "moves by 0 file units" in said
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes")

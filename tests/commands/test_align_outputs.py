@@ -54,7 +54,10 @@ def test_matrix_alone_goes_to_stdout_and_the_summary_to_stderr(cli, fake, scans)
     np.testing.assert_array_equal(matrix, QUARTER_TURN)
     assert "75% of the source, 50% of the target" in result.stderr
     assert "90.000 degrees" in result.stderr
-    assert "aligned; confidence 97%" in result.stderr and "because  the surfaces agree" in result.stderr
+    assert (
+        "aligned and trusted; confidence 97%" in result.stderr
+        and "because  the surfaces agree" in result.stderr
+    )
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".npy", ".json"])

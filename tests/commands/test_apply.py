@@ -97,6 +97,8 @@ def test_nothing_is_replaced_unasked(cli, files: Path) -> None:
         (["missing.txt", "in.ply", "-o", "out.ply"], 4, "no such file"),
         (["quarter.txt", "missing.ply", "-o", "out.ply"], 4, "no such file"),
         (["in.ply", "in.ply", "-o", "out.ply"], 4, "no transformation file"),
+        (["in.ply", "quarter.txt", "-o", "x.ply"], 2, "utopic apply quarter.txt in.ply -o x.ply"),
+        (["in.ply", "shift.json", "-o", "x.ply"], 2, "in.ply looks like a scan and shift.json like a"),
         (["quarter.txt#2", "in.ply", "-o", "out.ply"], 4, "no entry '2'"),
         (["mirror.txt", "in.ply", "-o", "out.ply"], 4, "mirrors"),
         (["quarter.txt", "in.ply", "-o", "nowhere/out.ply"], 5, "folder"),
@@ -158,6 +160,47 @@ def test_a_scan_finds_its_place_in_a_model(cli, files: Path) -> None:
     )
     expected = read(files / "in.ply") @ QUARTER[:3, :3].T + [1, 2, 3]
     np.testing.assert_allclose(read(files / "out.ply"), expected, atol=1e-14)
+
+
+def test_a_transformation_of_a_model_names_its_frames(cli, files: Path) -> None:
+    scans = [{"scan": "the #1 scan", "T_world_scan": QUARTER.tolist()}]
+    (files / "poses.json").write_text(json.dumps({"scans": scans}))
+    asked = ("transformation", f"{files / 'poses.json'}#the #1 scan")
+    ros = cli(*asked, "--form", "ros").stdout
+    assert '# p_target = T_target_source @ p_source, target: world, source: "the \\u00231 scan"' in ros
+    assert '\n  frame_id: world\nchild_frame_id: "the \\u00231 scan"\n' in ros
+    (files / "T.yaml").write_text(ros)
+    np.testing.assert_allclose(read_transformation(files / "T.yaml"), QUARTER, atol=1e-14)
+    there, back = (json.loads(cli(*asked, "--form", "json", *more).stdout) for more in ([], ["--invert"]))
+    assert (there["target"], there["source"]) == ("world", "the #1 scan")
+    assert (back["target"], back["source"]) == ("the #1 scan", "world")
+    after = json.loads(cli(asked[0], files / "shift.json", asked[1], "--form", "json").stdout)
+    assert (after["target"], after["source"]) == ("target", "the #1 scan")
+    plain = cli("transformation", files / "shift.json", "--form", "ros", "--invert").stdout
+    assert "  frame_id: target\nchild_frame_id: source\n" in plain
+
+
+def test_a_scan_without_a_place_in_a_model_is_told_why(cli, files: Path) -> None:
+    poses = {"scans": [{"scan": "in", "T_world_scan": None}]}
+    poses["left_out"] = [{"scan": "in", "reason": "no pair with it was tried"}]
+    (files / "poses.json").write_text(json.dumps(poses))
+    result = cli("apply", f"{files / 'poses.json'}#in", files / "in.ply", "-o", files / "out.ply")
+    assert result.exit_code == 4
+    assert "in was left out of the batch (no pair with it was tried), so it has no pose" in result.stderr
+
+
+def test_rows_of_a_batch_point_to_its_named_poses(cli, files: Path) -> None:
+    (files / "poses.txt").write_bytes(2 * format_transformation(QUARTER, "kitti"))
+    asked = ("apply", files / "poses.txt", files / "in.ply", "-o", files / "out.ply")
+    assert "poses.json" not in cli(*asked).stderr
+    (files / "poses.json").write_text("{}")
+    assert f"'poses.txt#1', or by its scan's name, as in '{files / 'poses.json'}#NAME'" in cli(*asked).stderr
+
+
+def test_an_option_of_another_name_is_hinted_at(cli, files: Path) -> None:
+    result = cli("transformation", files / "quarter.txt", "--to", "ros")
+    assert result.exit_code == 2
+    assert "No such option: --to; did you mean --form?" in result.stderr
 
 
 def test_align_writes_the_same_forms(cli, fake, scans, tmp_path: Path) -> None:

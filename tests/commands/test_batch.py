@@ -81,6 +81,7 @@ def test_parts_and_nothing_have_exit_codes_of_their_own(cli, stubbed, tmp_path):
     [
         (["scans", "--out-dir", "out", "--pairs", "x"], 2, "--pairs x: choose auto, all, sequential"),
         (["scans", "--out-dir", "out", "--merge-voxel", "1"], 2, "--merge-voxel needs --merge"),
+        (["scans", "-o", "out"], 2, "No such option: -o; did you mean --out-dir?"),
         (["scans", "--out-dir", "scans"], 2, "choose another --out-dir"),
         (["scans", "--out-dir", "out", "--resume", "--overwrite"], 2, "choose one"),
         (["scans", "--out-dir", "out", "--cluster", "tcp://x:1", "--workers", "2"], 2, "choose one"),

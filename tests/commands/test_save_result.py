@@ -85,5 +85,27 @@ def test_scans_that_are_not_the_results_are_refused(aligned, scans, tmp_path: Pa
     assert not (tmp_path / "out").exists()
 
 
+def test_other_scans_of_as_many_points_are_refused(aligned, scans, tmp_path: Path) -> None:
+    clouds = [read_scan(path) for path in scans]
+    other = clouds[1].cloud.points.copy()
+    other[7, 2] += 1e-12
+    with pytest.raises(UsageError, match=r"target\.ply: its points are not those of the result's target"):
+        save(aligned, scans[0], other, tmp_path / "out")
+    holes = np.full((60, 3), np.nan)
+    holes[clouds[0].kept] = clouds[0].cloud.points
+    with pytest.raises(UsageError, match=r"source\.ply: its points are not those"):
+        save(aligned, np.roll(holes, 1, axis=0), scans[1], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    save(aligned, holes, clouds[1].cloud.points, tmp_path / "out")
+
+
+def test_files_of_the_arrays_aligned_are_theirs(fake, scans, tmp_path: Path) -> None:
+    arrays = [read_scan(path).cloud.points for path in scans]
+    assert save(align(*arrays), *scans, tmp_path / "out")
+    doubled = align(arrays[0] * 2, arrays[1])
+    with pytest.raises(UsageError, match=r"a\.ply: its points are not those of the result's source"):
+        save(doubled, *scans, tmp_path / "doubled")
+
+
 def test_the_package_hands_it_out() -> None:
     assert "save" in dir(utopic_cli) and utopic_cli.save is save

@@ -44,7 +44,7 @@ def test_poses_are_no_points(tmp_path: Path, data: bytes, what: str) -> None:
     for suffix in ("txt", "csv", "xyz"):
         (path := tmp_path / f"poses.{suffix}").write_bytes(data)
         for to_align in (True, False):
-            with pytest.raises(InputError, match=f"is {what}, not points; 'utopic transformation' reads it"):
+            with pytest.raises(InputError, match=f"is {what}, not points; name the scan here"):
                 read_scan(path, to_align=to_align)
 
 
@@ -57,6 +57,8 @@ def test_points_are_no_poses() -> None:
         rows(points, ones),
         rows(points, ones, normals),
         rows(rising, points[:, 1:], ones, normals, 0 * ones),  # curvature 0 everywhere
+        rows(rising, points[:, 1:], ones, normals, 0.03 * ones),  # a small curvature
+        b"x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0,0\n",  # points with an orientation each
         rows(points, normals, ones, ones, ones, 0 * ones, 0 * ones, 0 * ones),
         rows(points, np.tile(np.arange(9.0), (80, 1))),
         rows(points[:4], ones[:4]),

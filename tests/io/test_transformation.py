@@ -299,3 +299,9 @@ def test_a_table_of_poses_points_to_the_poses_file(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("name,group\n")
     with pytest.raises(InputError, match=r"poses\.json#NAME"):
         read_transformation(tmp_path / "poses.csv")
+
+
+def test_words_are_named_with_their_line(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("# a comment\n1 2\nDear all,\nthese are the scans.\n")
+    with pytest.raises(InputError, match="line 3 holds 'Dear', which is no number; a transformation is"):
+        read_transformation(tmp_path / "letter.txt")

@@ -32,8 +32,29 @@ def test_what_is_no_scan_is_left_out_and_said_in_a_line(scans: Path) -> None:
     assert [scan.name for scan in found.scans] == ["a", "b"]
     assert found.notes == (
         f"{scans}: 8 files are no scans and left out: no scan format: 4 (1.jpg, 2.jpg, 3.jpg, ...); "
-        "text without points: 2 (README.txt, notes.csv); poses, not points: 2 (T.xyz, poses.txt)",
+        "text without points: 2; poses, not points: 2",
     )
+
+
+def test_scans_in_subfolders_are_said_not_to_be_taken(scans: Path) -> None:
+    for name in ("day-1", "day-2", "photos", ".hidden"):
+        (scans / name).mkdir()
+    for name in ("day-1", "day-2", ".hidden"):
+        (scans / name / "c.ply").write_bytes((scans / "a.ply").read_bytes())
+    (scans / "photos" / "1.jpg").write_bytes(b"\xff\xd8\xff")
+    (scans / "photos" / "notes.txt").write_text("Of the 3rd of May.\n")
+    found = find_scans([scans])
+    assert len(found.scans) == 2
+    assert found.notes == (
+        f"{scans}: sub-folders are not looked into; scans lie in 2 (day-1, day-2): name these as well",
+    )
+
+
+def test_one_file_that_is_no_scan_is_told_as_such(tmp_path: Path) -> None:
+    for name, text in (("notes.txt", "Scans of a thing.\n"), ("notes.md", "# Scans\n")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=r": is no scan \(.*\); a batch takes a folder or several scans"):
+            find_scans([tmp_path / name])
 
 
 def test_points_in_text_are_taken_or_told_as_scans(scans: Path) -> None:

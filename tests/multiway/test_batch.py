@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import sys
 from functools import partial
 from pathlib import Path
@@ -82,7 +83,10 @@ def test_mixed_objects_and_a_lone_scan_become_groups(tmp_path):
     content = poses(tmp_path)
     assert [group["scans"] for group in content["groups"]] == [["0", "2", "4", "6"], ["1", "3", "5"]]
     assert [entry["scan"] for entry in content["left_out"]] == ["z"]
-    assert "connects with no other" in content["left_out"][0]["reason"]
+    reason = content["left_out"][0]["reason"]
+    assert "connects with no other scan (7 pairs: 7 unconfirmed); best z--" in reason
+    assert re.search(r": confidence 0\.\d\d, overlap \d+%; scan more in between, or look at it", reason)
+    assert reason.endswith(".ply") and f"utopic align {tmp_path / 'scans' / 'z.ply'} " in reason
     assert len(read_scan(tmp_path / "out" / "merged-2.ply").cloud) == 600
     assert len((tmp_path / "out" / "poses.txt").read_text().splitlines()) == 4
 

@@ -232,6 +232,29 @@ def test_loops_are_counted_for_each_pair():
     assert beliefs[2, 1].support > 0 > beliefs[3, 0].doubt
 
 
+def test_loops_of_a_used_pair_are_those_of_used_pairs():
+    """Scan 3 is tied by nonsense that nobody believes: not held against those that hold."""
+    world = World(4)
+    for pair in every(3):
+        world.pair(*pair)
+    for other in range(3):
+        world.pair(3, other, right=False, confidence=0.05, trusted=False)
+    told = {(pair.source, pair.target): pair for pair in world.model().pairs}
+    assert told[1, 0].verdict == USED and told[1, 0].belief.disagree == 1
+    assert told[1, 0].loops == (1, 0)
+    assert told[3, 0].verdict == UNCONFIRMED and told[3, 0].loops == (0, 2)
+    assert told[3, 0].reason == "its loops run through unreliable pairs"
+
+
+def test_loops_of_reliable_pairs_that_speak_against_a_pair_are_its_reason():
+    world = World(3)
+    world.pair(1, 0)
+    world.pair(2, 0, right=False, confidence=0.4, trusted=False)
+    world.pair(2, 1, right=False, confidence=0.3, trusted=False)
+    told = {(pair.source, pair.target): pair.reason for pair in world.model().pairs}
+    assert told[2, 0] == "loops: 1 against it, 0 for it"
+
+
 def test_displacement_counts_turns_and_shifts_by_the_scan_s_size():
     rng = np.random.default_rng(0)
     points = rng.standard_normal((500, 3)) * (3.0, 1.0, 0.2)
@@ -286,3 +309,15 @@ def test_a_group_falls_into_parts_where_nothing_holds_it_together():
     assert [sorted(part.T_group_scan) for part in parts] == [[0, 1, 2], [3, 4]]
     assert [part.used for part in parts] == [(0, 1, 2), (3,)]
     assert all(np.isfinite(place).all() for part in parts for place in part.T_group_scan.values())
+
+
+def test_weak_pairs_that_err_alike_join_no_two_things_that_look_alike():
+    world = World(10, objects=2)
+    for later, earlier in every(10):
+        if (later - earlier) % 2 == 0:
+            world.pair(later, earlier)
+    for later, earlier, confidence in ((1, 0, 0.14), (3, 0, 0.3), (1, 2, 0.3)):
+        world.pair(later, earlier, confidence=confidence, trusted=False, overlap=0.4)
+    assert [len(group.T_world_scan) for group in world.model().groups] == [5, 5]
+    world.pair(3, 2)  # one that is trusted, and agrees
+    assert [len(group.T_world_scan) for group in world.model().groups] == [10]

@@ -8,6 +8,7 @@ import pytest
 
 from tests.multiway.stubs import write_scans
 from utopic_cli.errors import InputError
+from utopic_cli.multiway.plan import first_pairs
 from utopic_cli.multiway.scans import LONGEST_NAME, distinct_names, find_scans
 
 
@@ -18,7 +19,8 @@ def test_a_folder_gives_its_scans_in_natural_order(tmp_path):
     write_scans(tmp_path / "deeper", ["scan3.ply"])
     found = find_scans([tmp_path])
     assert [scan.name for scan in found.scans] == ["scan1", "scan2", "scan10"]
-    (note,) = found.notes
+    note, below = found.notes
+    assert "scans lie in 1 (deeper)" in below
     assert note.endswith("2 files are no scans and left out: no scan format: 2 (notes.md, truth.json)")
     assert all(len(scan.sha256) == 64 for scan in found.scans)
 
@@ -49,6 +51,25 @@ def test_too_few_files_or_no_such_input(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no FIFOs here")
+def test_a_pattern_that_matches_a_folder_only_adds_nothing_and_ends_nothing(tmp_path):
+    write_scans(tmp_path, ["a.ply", "b.ply"])
+    (tmp_path / "deeper").mkdir()
+    found = find_scans([tmp_path, tmp_path / "deep*"])
+    assert [scan.name for scan in found.scans] == ["a", "b"]
+    with pytest.raises(InputError, match="no file matches it"):
+        find_scans([tmp_path, tmp_path / "shallow*"])
+
+
+def test_listed_pairs_of_a_file_that_cant_be_read_are_not_planned(tmp_path):
+    write_scans(tmp_path, ["a.ply", "b.ply", "cut.ply"])
+    (tmp_path / "cut.ply").write_bytes((tmp_path / "cut.ply").read_bytes()[:-50])
+    (tmp_path / "pairs.csv").write_text("cut,a\nb,a\n")
+    scans = find_scans([tmp_path / name for name in ("a.ply", "b.ply", "cut.ply")])
+    usable = [i for i, scan in enumerate(scans.scans) if scan.problem is None]
+    assert usable == [0, 1]
+    assert first_pairs(str(tmp_path / "pairs.csv"), scans, usable) == ((1, 0),)
+
+
 def test_a_pipe_never_blocks_and_is_a_problem_of_its_own(tmp_path):
     write_scans(tmp_path, ["a.ply", "b.ply"])
     for name in ("c.ply", "d.txt"):

@@ -133,7 +133,8 @@ def test_what_a_person_asks_for_is_in_the_page(pair):
     words = Outline(rendered(pair.with_result(warnings=("watch out",)), warnings=["odd header"])).words
     for wanted in (
         "a.ply", "b.ply", "No verdict", "nobody checked it", "watch out", "odd header", "41%", "52%",
-        "0.0123", "network 1.25 s", "total 1.75 s", "some-weights", "0123456789ab", "seed 7",
+        "0.0123", "network 1.25 s", "total, without reading and writing 1.75 s",
+        "some-weights", "0123456789ab", "seed 7",
         f"all {len(pair.source):,} points of the source",
     ):  # fmt: skip
         assert wanted in words, wanted

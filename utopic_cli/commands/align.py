@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -229,7 +229,7 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
     check_outputs(
         request.plan, [*inputs, *files_behind([request.init] if request.init else [])], request.overwrite
     )
-    with console.progress() as progress:
+    with console.progress(lines=False) as progress:
         progress("loading libraries")
         from utopic_cli import pipeline
         from utopic_cli.io.scan import read_scan
@@ -242,9 +242,6 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
             progress(f"reading {request.target.name}")
             target = read_scan(request.target, seed=request.options.seed)
             initial = read_transformation(request.init) if request.init else None
-        if source.sha256 == target.sha256:
-            same = f"{source.path} and {target.path}: both files hold the same bytes; check their names"
-            target = replace(target, warnings=(*target.warnings, same))
         result = pipeline.register(
             source.cloud, target.cloud, request.options, initial=initial, progress=progress
         )
@@ -265,7 +262,7 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
 
 def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> None:
     """Say the verdict, what it rests on, the motion, and the files written."""
-    from utopic_cli.result_display import headline
+    from utopic_cli.result_display import headline, residual_in_words, rounded
 
     report, result = outcome.report, outcome.result
     console.warnings(tuple(report["warnings"]))
@@ -279,9 +276,9 @@ def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> N
     source, target = fit.overlap_ratio["source"], fit.overlap_ratio["target"]
     console.fact("overlap", f"{source:.0%} of the source, {target:.0%} of the target")
     if math.isfinite(fit.inlier_rmse):
-        console.fact("residual", f"{fit.inlier_rmse:.4g} file units rms where they overlap")
+        console.fact("residual", residual_in_words(fit))
     motion = report["about_source_centroid"]
-    shift = math.hypot(*motion["translation"])
+    shift = rounded(math.hypot(*motion["translation"]), report["target"]["extent"]["diagonal"])
     angle = f"{motion['angle_deg']:.3f} degrees about the source's centroid"
     console.fact("motion", f"{angle}, which moves by {shift:.6g} file units")
     if console.verbose:

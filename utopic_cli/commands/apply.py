@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -52,6 +53,7 @@ def apply(
     *transformations, path = files
     if not transformations:
         raise UsageError("give a transformation and a scan: utopic apply T.txt in.ply -o out.ply")
+    _refuse_swapped(files, output)
     if output.is_dir():
         raise UsageError(f"{output}: is a folder; name a file in it: -o {output / path.name}")
     if output.suffix.lower() != path.suffix.lower():
@@ -65,7 +67,7 @@ def apply(
         from utopic_cli.report import about_centroid
 
         _refuse_transformation(path)
-        product = product_of(transformations, invert)
+        product, _ = product_of(transformations, invert)
         progress(f"reading {path.name}")
         scan = read_scan(path, to_align=False)
         progress(f"writing {output.name}")
@@ -77,17 +79,36 @@ def apply(
     console.line(f"{path} -> {output}: {turn}, which moves by {shift:.6g} file units")
 
 
+def _refuse_swapped(files: list[Path], output: Path) -> None:
+    """Refuse a scan that comes before a transformation, as far as their names tell them apart."""
+    from utopic_cli.io.scan import SUFFIXES
+    from utopic_cli.io.transformation import form_of, split_entry
+
+    first, *others = files
+    last = others[-1]
+    scan = first.suffix.lower() in SUFFIXES and form_of(first) is None
+    if scan and form_of(split_entry(last)[0]) is not None and (last.suffix.lower() != ".txt" or _reads(last)):
+        raise UsageError(
+            f"{first} looks like a scan and {last} like a transformation, but the scan comes last:"
+            f" utopic apply {shlex.join(map(str, (*others, first)))} -o {output}"
+        )
+
+
 def _refuse_transformation(path: Path) -> None:
     """Refuse a 4x4 in the place of the scan: its rows would pass for points."""
+    if path.suffix.lower() == ".txt" and _reads(path):
+        raise UsageError(
+            f"{path}: is a transformation, but the last file is the scan that moves;"
+            " 'utopic transformation' composes transformations"
+        )
+
+
+def _reads(path: Path) -> bool:
+    """Tell whether a file reads as one transformation."""
     from utopic_cli.io.transformation import read_transformation
 
-    if path.suffix.lower() != ".txt":
-        return
     try:
         read_transformation(path)
     except InputError:
-        return
-    raise UsageError(
-        f"{path}: is a transformation, but the last file is the scan that moves;"
-        " 'utopic transformation' composes transformations"
-    )
+        return False
+    return True

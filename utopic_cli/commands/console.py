@@ -201,14 +201,17 @@ class Console:
             self.line(f"utopic: warning: {text}")
 
     @contextmanager
-    def progress(self) -> Iterator[Callable[[str], None]]:
+    def progress(self, lines: bool = True) -> Iterator[Callable[[str], None]]:
         """Show the step at work while the block runs, and if verbose what the library logs.
+
+        Args:
+            lines: say a step now and then where there is no terminal; not for seconds of work.
 
         Yields:
             A function to call with the name of each step as it begins. One that begins with a count,
             like "12/90", gets a bar.
         """
-        with self._log_lines(), self._steps() as progress:
+        with self._log_lines(), self._steps(lines) as progress:
             yield progress
 
     @contextmanager
@@ -227,10 +230,10 @@ class Console:
             logger.removeHandler(handler)
 
     @contextmanager
-    def _steps(self) -> Iterator[Callable[[str], None]]:
+    def _steps(self, lines: bool) -> Iterator[Callable[[str], None]]:
         """Show the step at work; where there is no terminal, a line now and then."""
         if self.quiet or not self._rich.is_terminal:
-            yield self._now_and_then()
+            yield self._now_and_then() if lines else _unsaid
             return
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
         from rich.table import Column
@@ -260,6 +263,10 @@ class Console:
                 self.line(f"  at work: {step}")
 
         return progress
+
+
+def _unsaid(step: str) -> None:
+    """Take a step's name that nobody is told."""
 
 
 class _LogLines(logging.Handler):

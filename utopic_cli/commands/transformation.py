@@ -16,6 +16,8 @@ from utopic_cli.errors import UsageError
 if TYPE_CHECKING:
     import numpy as np
 
+    from utopic_cli.io.transformation import Frames
+
 Invert = Annotated[bool, typer.Option("--invert", help="Take the inverse of the whole product.")]
 Form = Literal["matrix", "npy", "json", "pdal", "open3d", "kitti", "tum", "ros"]
 
@@ -74,8 +76,8 @@ def transformation(
         raise UsageError("npy is no text; name a file with -o")
     plan = OutputPlan(files=(("transformation", output),) if output else ())
     check_outputs(plan, files_behind(files), overwrite)
-    product = product_of(files, invert)
-    content = format_transformation(product, wanted)
+    product, frames = product_of(files, invert)
+    content = format_transformation(product, wanted, frames)
     if output is None:
         to_stdout(content)
         return
@@ -93,8 +95,8 @@ def files_behind(transformations: Sequence[Path]) -> list[Path]:
     return [split_entry(path)[0] for path in transformations]
 
 
-def product_of(transformations: Sequence[Path], invert: bool) -> np.ndarray:
-    """Return the (4, 4) product of transformation files in the order given, or its inverse.
+def product_of(transformations: Sequence[Path], invert: bool) -> tuple[np.ndarray, Frames]:
+    """Return the (4, 4) product of transformation files in the order given, or its inverse, and its frames.
 
     Raises:
         InputError: a file can't be read, or is no rigid transformation.
@@ -104,7 +106,12 @@ def product_of(transformations: Sequence[Path], invert: bool) -> np.ndarray:
     import numpy as np
 
     from utopic_cli.geometry import rigid
-    from utopic_cli.io.transformation import read_transformation
+    from utopic_cli.io.transformation import UNNAMED, read_with_frames
 
-    product = reduce(np.matmul, [read_transformation(path) for path in transformations])
-    return rigid.invert(product) if invert else product
+    matrices, frames = zip(*map(read_with_frames, transformations), strict=True)
+    product = reduce(np.matmul, matrices)
+    target, source = frames[0][0], frames[-1][1]
+    if not invert:
+        return product, (target, source)
+    # What has no names is called target and source whichever way it leads.
+    return rigid.invert(product), UNNAMED if (target, source) == UNNAMED else (source, target)

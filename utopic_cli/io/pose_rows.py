@@ -13,7 +13,7 @@ from utopic_cli.io.transformation_rows import entries_of_rows
 START_BYTES = 1 << 16
 """The beginning of a file that is looked at."""
 
-_QUATERNION = {"qw", "qx", "qy", "qz"}
+_QUATERNION, _POINT = {"qw", "qx", "qy", "qz"}, {"x", "y", "z"}
 _TOLERANCE = 1e-3  # of rotations and quaternions written with few digits
 _MATRIX, _TABLE = "a 4x4 matrix", "a table of poses"
 
@@ -31,7 +31,8 @@ def poses_in(start: bytes) -> str | None:
     if len(start) >= START_BYTES:
         text = text[: text.rfind(b"\n") + 1]  # the last line may be cut
     named = text.lower().split(b"\n", 1)[0].decode("latin-1").strip("#/ \r\ufeff")
-    if {name.strip(" \"'") for name in named.replace(";", ",").replace(" ", ",").split(",")} >= _QUATERNION:
+    names = {name.strip(" \"'") for name in named.replace(";", ",").replace(" ", ",").split(",")}
+    if names >= _QUATERNION and not names >= _POINT:  # points may carry an orientation each
         return _TABLE
     rows = [
         line for line in map(bytes.strip, text.splitlines()) if line and not line.startswith((b"#", b"//"))
@@ -63,5 +64,6 @@ def _is_trajectory(rows: Sequence[bytes]) -> bool:
     except FormatError:
         return False
     unit = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _TOLERANCE
-    # A scalar part that is 0 throughout is rather a further column behind normals.
-    return bool(unit.all() and (np.diff(table[:, 0]) > 0).all() and table[:, 7].any())
+    # Three that are of unit length throughout are rather normals, and the fourth a further column.
+    normals = np.abs(np.linalg.norm(table[:, 4:7], axis=1) - 1.0) <= _TOLERANCE
+    return bool(unit.all() and (np.diff(table[:, 0]) > 0).all() and not normals.all())

@@ -170,19 +170,20 @@ def check_magic(data: bytes, kind: str) -> None:
         raise FormatError(f"is a {content.upper()} file by its content; rename it to end in .{content}")
 
 
-def check_points(points: np.ndarray, records: int) -> None:
+def check_points(points: np.ndarray, records: int, remedy: str = "export it again") -> None:
     """Refuse points that fix no transformation.
 
     Args:
         points: (N, 3) finite float64.
         records: how many points there were before those that are not finite were dropped.
+        remedy: what to do about points that no scan has; an array is not exported.
 
     Raises:
         FormatError: too few distinct points, all on a line, or coordinates beyond all reason.
     """
-    _check_coordinates(points, records)
+    _check_coordinates(points, records, remedy)
     if (points == points[0]).all():
-        raise FormatError(f"all of its {len(points)} points are equal; export it again")
+        raise FormatError(f"all of its {len(points)} points are equal; {remedy}")
     distinct = _count_distinct(points)
     if distinct < FEWEST_POINTS:
         raise FormatError(
@@ -196,11 +197,11 @@ def check_points(points: np.ndarray, records: int) -> None:
         raise FormatError("all of its points lie on a line; use a scan of a surface")
 
 
-def _check_coordinates(points: np.ndarray, records: int) -> None:
+def _check_coordinates(points: np.ndarray, records: int, remedy: str = "export it again") -> None:
     if len(points) == 0:
-        raise FormatError(f"none of its {records} points is finite; export it again")
+        raise FormatError(f"none of its {records} points is finite; {remedy}")
     if np.abs(points).max() > _LARGEST_COORDINATE:
-        raise FormatError("has coordinates beyond 1e100; the file is damaged, export it again")
+        raise FormatError(f"has coordinates beyond 1e100, which no scanner measures; {remedy}")
 
 
 def _count_distinct(points: np.ndarray) -> int:

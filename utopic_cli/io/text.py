@@ -59,7 +59,9 @@ def read_text(data: bytes, *, whole: bool = True) -> Records:
         raise FormatError("holds binary data, not text; check what it is, or export it again")
     poses = poses_in(data)
     if poses is not None:
-        raise FormatError(f"is {poses}, not points; 'utopic transformation' reads it, name the scan here")
+        raise FormatError(
+            f"is {poses}, not points; name the scan here ('utopic transformation' reads poses in .txt files)"
+        )
     end = b"\n" if b"\n" in data or b"\r" not in data else b"\r"
     lines = data.split(end)
     rows = [i for i, line in enumerate(lines) if is_content(line)]

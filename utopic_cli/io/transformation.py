@@ -19,9 +19,15 @@ from utopic_cli.io.plain_yaml import parse_yaml
 from utopic_cli.io.quaternion import quaternion_of
 from utopic_cli.io.records import FormatError
 from utopic_cli.io.transformation_rows import entries_of_rows
-from utopic_cli.io.transformation_tree import Entries, entries_of_tree
+from utopic_cli.io.transformation_tree import Entries, PlacedScans, entries_of_tree
 
 CONVENTION = "p_target = T_target_source @ p_source"
+
+Frames = tuple[str, str]
+"""Names of the frames that a transformation leads to and from."""
+
+UNNAMED: Frames = ("target", "source")
+WORLD = "world"
 
 FORMS = {
     "matrix": "4 rows of 4 numbers: CloudCompare, PDAL, NumPy's loadtxt",
@@ -65,12 +71,13 @@ def form_of(path: str | os.PathLike[str]) -> str | None:
     return None
 
 
-def format_transformation(transformation: np.ndarray, form: str) -> bytes:
+def format_transformation(transformation: np.ndarray, form: str, frames: Frames = UNNAMED) -> bytes:
     """Return a (4, 4) transformation as the bytes of a file.
 
     Args:
         transformation: (4, 4) float64, ``p_target = T_target_source @ p_source``.
         form: one of ``FORMS``, or a suffix that stands for one. Text carries 17 digits.
+        frames: what target and source are, for the forms that name them.
 
     Raises:
         OutputError: the form is another one.
@@ -85,7 +92,8 @@ def format_transformation(transformation: np.ndarray, form: str) -> bytes:
         np.save(stream, matrix, allow_pickle=False)
         return stream.getvalue()
     if form == "json":
-        return _json({"convention": CONVENTION, "T_target_source": matrix.tolist()})
+        named = {} if frames == UNNAMED else dict(zip(UNNAMED, frames, strict=True))
+        return _json({"convention": CONVENTION, **named, "T_target_source": matrix.tolist()})
     if form == "pdal":
         return _json({"pipeline": [{"type": "filters.transformation", "matrix": " ".join(rows)}]})
     if form == "open3d":
@@ -97,7 +105,7 @@ def format_transformation(transformation: np.ndarray, form: str) -> bytes:
             [" ".join(["0", *(f"{v:.17g}" for v in (*matrix[:3, 3], *quaternion_of(matrix[:3, :3])))])]
         )
     if form == "ros":
-        return _lines(_ros_lines(matrix))
+        return _lines(_ros_lines(matrix, frames))
     raise OutputError(f"a transformation can't be written as '{form}'; use one of {', '.join(FORMS)}")
 
 
@@ -109,13 +117,19 @@ def _json(content: dict[str, object]) -> bytes:
     return (json.dumps(content, indent=1) + "\n").encode("ascii")
 
 
-def _ros_lines(matrix: np.ndarray) -> list[str]:
+def _ros_lines(matrix: np.ndarray, frames: Frames) -> list[str]:
     """Return a TransformStamped: it takes points of the child's frame to the header's frame."""
 
     def vector(names: str, values: np.ndarray) -> list[str]:
         return [f"    {name}: {float(value)!r}" for name, value in zip(names, values)]
 
-    lines = [f"# {CONVENTION}", "header:", "  frame_id: target", "child_frame_id: source", "transform:"]
+    # Only names that are no YAML of their own stand bare; our reader takes a # for a comment's.
+    target, source = (
+        frame if frame in (*UNNAMED, WORLD) else json.dumps(frame).replace("#", "\\u0023") for frame in frames
+    )
+    what = "" if frames == UNNAMED else f", target: {target}, source: {source}"
+    lines = [f"# {CONVENTION}{what}", "header:", f"  frame_id: {target}", f"child_frame_id: {source}"]
+    lines += ["transform:"]
     lines += ["  translation:", *vector("xyz", matrix[:3, 3])]
     return [*lines, "  rotation:", *vector("xyzw", quaternion_of(matrix[:3, :3]))]
 
@@ -135,13 +149,19 @@ def split_entry(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
 
 
 def read_transformation(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read a rigid transformation, see ``read_with_frames``; returns its matrix alone."""
+    return read_with_frames(path)[0]
+
+
+def read_with_frames(path: str | os.PathLike[str]) -> tuple[np.ndarray, Frames]:
     """Read a rigid transformation in any of the forms; ``FILE#ENTRY`` names one of several.
 
     ``.npy`` is NumPy's, ``.json`` and ``.yaml`` are told by their keys, every other suffix is
     rows of numbers, told by their number and length.
 
     Returns:
-        (4, 4) float64 with its rotation projected to the nearest exact one, unless it is one to 1e-12.
+        (4, 4) float64 with its rotation projected to the nearest exact one, unless it is one to 1e-12;
+        and its frames: of a batch's model the world and the scan, else ``UNNAMED``.
 
     Raises:
         InputError: the file can't be read, holds no transformation or several, or what it holds
@@ -156,7 +176,9 @@ def read_transformation(path: str | os.PathLike[str]) -> np.ndarray:
     if len(data) > _LARGEST_FILE:
         raise InputError(f"{file}: is too large for a transformation; check what it is")
     try:
-        return _rigid(_chosen(_entries(data, file.suffix.lower()), entry, file))
+        entries = _entries(data, file.suffix.lower())
+        name, matrix = _chosen(entries, entry, file)
+        return _rigid(matrix), (WORLD, name) if isinstance(entries, PlacedScans) else UNNAMED
     except FormatError as error:
         # A file's own words may be quoted: one plain line, whatever they are.
         text = "".join(letter if letter.isprintable() else "?" for letter in str(error))
@@ -183,19 +205,27 @@ def _entries(data: bytes, suffix: str) -> Entries:
     return entries_of_rows(data)
 
 
-def _chosen(entries: Entries, wanted: str | None, file: Path) -> np.ndarray:
-    """Return the one transformation, or the one that was named."""
+def _chosen(entries: Entries, wanted: str | None, file: Path) -> tuple[str, np.ndarray]:
+    """Return the one transformation, or the one that was named, and its name."""
+    if isinstance(entries, PlacedScans) and wanted in entries.left_out:
+        raise FormatError(
+            f"{wanted} was left out of the batch ({entries.left_out[wanted]}), so it has no pose"
+        )
     if not entries:
         raise FormatError("holds no transformation; check what it is")
     if wanted is None:
         if len(entries) > 1:
             first, last = entries[0][0], entries[-1][0]
+            poses = file.with_suffix(".json")
+            # The rows of a batch have no names, its JSON has.
+            table = file.name == "poses.txt" and poses.is_file()
             raise FormatError(
                 f"holds {len(entries)} transformations ('{first}' to '{last}'); "
                 f"name the one to take, as in '{file.name}#{first}'"
+                + (f", or by its scan's name, as in '{poses}#NAME'" if table else "")
             )
-        return entries[0][1]
-    found = [matrix for name, matrix in entries if name == wanted]
+        return entries[0]
+    found = [one for one in entries if one[0] == wanted]
     if len(found) != 1:
         names = ", ".join(name for name, _ in entries[:6]) + (", ..." if len(entries) > 6 else "")
         what = "no entry" if not found else f"{len(found)} entries"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from utopic_cli.io.ascii_table import parse_table
+from utopic_cli.io.ascii_table import is_number, parse_table
 from utopic_cli.io.quaternion import rigid_of
 from utopic_cli.io.records import FormatError
 from utopic_cli.io.transformation_tree import Entries
@@ -49,8 +49,22 @@ def entries_of_rows(data: bytes) -> Entries:
         return _numbered([rigid_of(pose[1:4], pose[4:]) for pose in poses])
     if not rows:
         raise FormatError(f"holds no numbers; a transformation is {_SHAPES}")
+    word = _first_word(data)
+    if word:
+        raise FormatError(f"{word}; a transformation is {_SHAPES}")
     lengths = " or ".join(str(width) for width in sorted(set(widths))[:3])
     raise FormatError(f"has {len(rows)} rows of {lengths} numbers; a transformation is {_SHAPES}")
+
+
+def _first_word(data: bytes) -> str:
+    """Return which line holds the first word that is no number, and the word; empty if none does."""
+    for number, line in enumerate(data.removeprefix(b"\xef\xbb\xbf").splitlines(), 1):
+        if line.strip().startswith((b"#", b"//")):
+            continue
+        for word in line.translate(_BRACKETS).split():
+            if not is_number(word):
+                return f"line {number} holds '{word[:24].decode('utf-8', 'replace')}', which is no number"
+    return ""
 
 
 def _numbered(matrices: list[np.ndarray]) -> Entries:

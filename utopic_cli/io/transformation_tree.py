@@ -12,6 +12,20 @@ from utopic_cli.io.records import FormatError
 Entries = list[tuple[str, np.ndarray]]
 """Transformations by name, (4, 4) float64 each, not yet checked for being rigid."""
 
+
+class PlacedScans(Entries):
+    """The transformations of a batch's model: from each scan's frame to the world's.
+
+    Attributes:
+        left_out: why other scans have none, by name.
+    """
+
+    def __init__(self, entries: Entries, left_out: dict[str, str]) -> None:
+        """Keep both."""
+        super().__init__(entries)
+        self.left_out = left_out
+
+
 _PDAL_STAGE = "filters.transformation"
 _TRANSLATIONS = ("translation", "position")
 _ROTATIONS = ("rotation", "orientation", "quaternion")
@@ -41,7 +55,7 @@ def entries_of_tree(content: Any) -> Entries:
     if "class_name" in content:
         return _open3d(content)
     if isinstance(content.get("scans"), list):
-        return _placed_scans(content["scans"])
+        return _placed_scans(content["scans"], content.get("left_out"))
     if isinstance(content.get("transforms"), list):  # ROS: tf2_msgs/TFMessage
         return [entry for stamped in content["transforms"] for entry in entries_of_tree(stamped)]
     for wrapper in _WRAPPERS:
@@ -59,12 +73,16 @@ def entries_of_tree(content: Any) -> Entries:
     )
 
 
-def _placed_scans(scans: list[Any]) -> Entries:
+def _placed_scans(scans: list[Any], left_out: Any) -> PlacedScans:
     placed = [scan for scan in scans if isinstance(scan, dict) and scan.get("T_world_scan") is not None]
-    return [
-        (str(scan.get("scan", number)), _matrix(scan["T_world_scan"], "'T_world_scan'"))
-        for number, scan in enumerate(placed, 1)
-    ]
+    without = [scan for scan in left_out if isinstance(scan, dict)] if isinstance(left_out, list) else []
+    return PlacedScans(
+        [
+            (str(scan.get("scan", number)), _matrix(scan["T_world_scan"], "'T_world_scan'"))
+            for number, scan in enumerate(placed, 1)
+        ],
+        {str(scan.get("scan")): str(scan.get("reason")) for scan in without},
+    )
 
 
 def _pdal(stages: Any) -> Entries:

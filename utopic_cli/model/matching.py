@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from utopic_cli.model.threads import one_thread
+from utopic_cli.model.one_thread import one_thread
 
 
 @one_thread()

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from utopic_cli.model.threads import one_thread
+from utopic_cli.model.one_thread import one_thread
 
 
 class OverlapDistribution(NamedTuple):

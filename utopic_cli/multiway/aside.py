@@ -63,14 +63,48 @@ def why_no_scan(path: Path) -> str | None:
     return "text without points" if prose and problem_at_start(start, size, kind) else None
 
 
+def scans_below(folder: Path) -> str | None:
+    """Say in a line which sub-folders hold scans, none of which are taken; None if none does.
+
+    Args:
+        folder: a folder of scans.
+    """
+    try:
+        inside = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    except OSError:  # that is said of the folder itself
+        return None
+    names = [path.name for path in inside if _holds_scan(path)]
+    if not names:
+        return None
+    shown = printable(", ".join([*names[:NAMES_SAID], *["..."] * (len(names) > NAMES_SAID)]))
+    return (
+        f"{folder}: sub-folders are not looked into; scans lie in {len(names)} ({shown}): name these as well"
+    )
+
+
+def _holds_scan(folder: Path) -> bool:
+    try:
+        return any(
+            path.suffix.lower() in SUFFIXES
+            and path.suffix.lower() not in DOUBTFUL_SUFFIXES
+            and path.is_file()
+            and why_no_scan(path) is None
+            for path in folder.iterdir()
+        )
+    except OSError:
+        return False
+
+
 def said_of(place: Path, aside: Sequence[Aside]) -> str:
     """Return in a line what of a folder or pattern is not taken, and why."""
     by_reason: dict[str, list[str]] = {}
     for one in aside:
         by_reason.setdefault(one.reason, []).append(one.path.name)
     parts = []
+    left = NAMES_SAID
     for reason, names in by_reason.items():
-        shown = ", ".join([*names[:NAMES_SAID], *["..."] * (len(names) > NAMES_SAID)])
-        parts.append(f"{reason}: {len(names)} ({printable(shown)})")
+        shown = ", ".join([*names[:left], *["..."] * (len(names) > left)])
+        parts.append(f"{reason}: {len(names)}" + (f" ({printable(shown)})" if left else ""))
+        left = max(0, left - len(names))
     count = "1 file is no scan" if len(aside) == 1 else f"{len(aside)} files are no scans"
     return f"{place}: {count} and left out: {'; '.join(parts)}"

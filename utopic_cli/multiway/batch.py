@@ -21,7 +21,7 @@ from utopic_cli.multiway.journal import Journal, fingerprint
 from utopic_cli.multiway.lock import locked
 from utopic_cli.multiway.merge import fields_lost, write_merged
 from utopic_cli.multiway.model import Model, build_model
-from utopic_cli.multiway.outcome import BatchOutcome, ScanEntry, pair_name
+from utopic_cli.multiway.outcome import BatchOutcome, ScanEntry, pair_name, why_alone
 from utopic_cli.multiway.pace import Pace, Progress
 from utopic_cli.multiway.page import batch_page
 from utopic_cli.multiway.plan import BatchPlan, BatchRequest, first_pairs, plan_batch
@@ -233,7 +233,7 @@ class _Batch:
                 place = model.groups[group].T_world_scan[number]
                 entries.append(replace(entry, group=group + 1, T_world_scan=place))
             else:
-                entries.append(replace(entry, left_out=_why_alone(number, model)))
+                entries.append(replace(entry, left_out=why_alone(number, model, self._files, records)))
         warnings = [
             text if str(self._files[number].path) in text else f"{self._files[number].path}: {text}"
             for number, record in described.items()
@@ -301,17 +301,6 @@ def weights_of(options: AlignOptions) -> dict[str, str]:
 
     _, card = load_network(options.weights, options.device)
     return {"name": str(card["name"]), "sha256": str(card["sha256"]), "card": fingerprint(card)}
-
-
-def _why_alone(number: int, model: Model) -> str:
-    own = [pair for pair in model.pairs if number in (pair.source, pair.target)]
-    if not own:
-        return "no pair with it was tried"
-    reasons: dict[str, int] = {}
-    for pair in own:
-        reasons[pair.verdict] = reasons.get(pair.verdict, 0) + 1
-    said = ", ".join(f"{count} {verdict}" for verdict, count in sorted(reasons.items()))
-    return f"connects with no other scan ({len(own)} pairs: {said})"
 
 
 def _ref(scan: ScanFile) -> ScanRef:

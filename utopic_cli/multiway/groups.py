@@ -21,8 +21,9 @@ from utopic_cli.geometry.rigid import invert
 from utopic_cli.multiway.edges import Edge, ScanShape, displacements
 from utopic_cli.multiway.loops import CLOSES, Belief, agreement, disagreement, log_odds
 
-ENOUGH = log_odds(0.95)
-"""Evidence that joins two groups."""
+ENOUGH = log_odds(0.999)
+"""Evidence that joins two groups where no pair across is trusted: among many groups some look alike, and then
+several pairs may err alike."""
 
 ENOUGH_IF_TRUSTED = 0.0
 """Where a pair across is trusted by itself, loops only must not speak against it."""

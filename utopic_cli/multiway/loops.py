@@ -32,6 +32,10 @@ ACCIDENT = 0.02
 """Chance that a wrong answer closes a loop: scans of one object are not wrong in just any way."""
 
 
+UNRELIABLE = 0.1
+"""What a loop through a pair with less chance to be right says of the others is worth nothing to a reader."""
+
+
 @dataclass(frozen=True)
 class Belief:
     """What is thought of one edge.
@@ -41,12 +45,14 @@ class Belief:
         doubt: by how much those that don't change them: a negative number, or 0.
         agree: triangles through it that close.
         disagree: triangles through it that don't.
+        weighty: those of them whose other two pairs are both reliable.
     """
 
     support: float
     doubt: float
     agree: int
     disagree: int
+    weighty: int = 0
 
 
 def log_odds(chance: float) -> float:
@@ -115,7 +121,7 @@ def believe(edges: Sequence[Edge], shapes: Mapping[int, ScanShape]) -> list[Beli
         shapes: of the scans, by index.
     """
     support, doubt = [0.0] * len(edges), [0.0] * len(edges)
-    agree, disagree = [0] * len(edges), [0] * len(edges)
+    agree, disagree, weighty = [0] * len(edges), [0] * len(edges), [0] * len(edges)
     neighbours: dict[int, dict[int, int]] = defaultdict(dict)
     for number, edge in enumerate(edges):
         neighbours[edge.source][edge.target] = number
@@ -131,14 +137,16 @@ def believe(edges: Sequence[Edge], shapes: Mapping[int, ScanShape]) -> list[Beli
                 rivals = max(edges[side].rivals for side in sides)
                 closes = shapes[first].displacement(motion) <= CLOSES
                 for place, side in enumerate(sides):
-                    others = math.prod(edges[other].prior for i, other in enumerate(sides) if i != place)
+                    beside = [edges[other].prior for i, other in enumerate(sides) if i != place]
+                    others = math.prod(beside)
                     if closes:
                         support[side] += agreement(others, rivals)
                         agree[side] += 1
                     else:
                         doubt[side] += disagreement(others)
                         disagree[side] += 1
-    return [Belief(*row) for row in zip(support, doubt, agree, disagree, strict=True)]
+                        weighty[side] += min(beside) >= UNRELIABLE
+    return [Belief(*row) for row in zip(support, doubt, agree, disagree, weighty, strict=True)]
 
 
 def _along(edge: Edge, start: int) -> np.ndarray:

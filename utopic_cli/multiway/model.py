@@ -32,6 +32,8 @@ class PairAnswer:
             an edge; ``failed``: there is no answer.
         reason: why, in plain words; of what is ``used`` only where a rival answer is.
         belief: what triangles say of it, or None.
+        loops: triangles through it that close and that don't; of a pair that is ``used`` only those
+            whose pairs all are.
         missed: by how much the final transformations miss it, as a share of the source's size.
         prior: chance that it is right from the pair alone, or None.
         overlap: the smaller overlap ratio, or None.
@@ -42,6 +44,7 @@ class PairAnswer:
     verdict: str
     reason: str = ""
     belief: Belief | None = None
+    loops: tuple[int, int] | None = None
     missed: float | None = None
     prior: float | None = None
     overlap: float | None = None
@@ -116,18 +119,24 @@ def build_model(records: Mapping[tuple[int, int], Mapping[str, Any]], shapes: di
             else:
                 evidence = 1.0 / (1.0 + math.exp(-min(rough.evidence, 700.0)))
                 groups.append(ModelGroup(_in_file_units(part.T_group_scan, shapes), evidence))
+    kept = sorted(used)
+    counted = dict(enumerate(beliefs))
+    counted.update(zip(kept, believe([edges[number] for number in kept], shapes), strict=True))
     for pair, number in number_of.items():
         edge, belief = edges[number], beliefs[number]
+        loops = counted[number].agree, counted[number].disagree
         if number in used:
             verdict, reason = USED, "" if edge is given[number] else INSTEAD
         elif number in missed:
             verdict, reason = REJECTED, f"contradicts the group by {missed[number]:.1%} of the scan's size"
+        elif belief.disagree and not (belief.agree or belief.weighty):
+            verdict, reason = UNCONFIRMED, "its loops run through unreliable pairs"
         elif belief.disagree > belief.agree:
-            verdict, reason = UNCONFIRMED, f"{belief.disagree} loops contradict it, {belief.agree} confirm it"
+            verdict, reason = UNCONFIRMED, f"loops: {belief.disagree} against it, {belief.agree} for it"
         else:
             verdict, reason = UNCONFIRMED, "not trusted by itself, and too few loops confirm it"
         answers[pair] = PairAnswer(
-            *pair, verdict, reason, belief, missed.get(number), edge.prior, edge.overlap
+            *pair, verdict, reason, belief, loops, missed.get(number), edge.prior, edge.overlap
         )
     groups.sort(key=lambda group: (-len(group.T_world_scan), min(group.T_world_scan)))
     return Model(tuple(groups), tuple(sorted(alone)), tuple(answers[pair] for pair in records))

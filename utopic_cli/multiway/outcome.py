@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shlex
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from utopic_cli.multiway.aside import Aside
-from utopic_cli.multiway.model import Model
+from utopic_cli.multiway.model import FAILED, Model
 from utopic_cli.multiway.scans import ScanFile
 
 WHOLE, IN_PARTS, NOTHING = 0, 6, 7
@@ -93,3 +95,37 @@ class BatchOutcome:
 def pair_name(source: ScanFile, target: ScanFile) -> str:
     """Return what a pair and its file are called."""
     return f"{source.name}--{target.name}"
+
+
+def why_alone(
+    number: int,
+    model: Model,
+    files: Sequence[ScanFile],
+    records: Mapping[tuple[int, int], Mapping[str, Any]],
+) -> str:
+    """Return why a scan connects with nothing, the pair that came closest, and what to do.
+
+    Args:
+        number: of the scan.
+        model: with all pairs.
+        files: of all scans.
+        records: by (source, target), as the journal keeps them.
+    """
+    own = [pair for pair in model.pairs if number in (pair.source, pair.target)]
+    if not own:
+        return "no pair with it was tried"
+    verdicts = Counter(pair.verdict for pair in own)
+    said = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
+    why = f"connects with no other scan ({len(own)} {'pair' if len(own) == 1 else 'pairs'}: {said})"
+    answered = [pair for pair in own if pair.verdict != FAILED]
+    if not answered:
+        return why
+    best = max(answered, key=lambda pair: (pair.prior or 0.0, pair.overlap or 0.0))
+    source, target = files[best.source], files[best.target]
+    confidence = records[best.source, best.target]["report"]["confidence"]
+    sure = "" if confidence is None else f"confidence {confidence:.2f}, "
+    scans = shlex.join((str(source.path), str(target.path)))
+    return (
+        f"{why}; best {pair_name(source, target)}: {sure}overlap {best.overlap or 0.0:.0%}; "
+        f"scan more in between, or look at it: utopic align {scans}"
+    )

@@ -197,7 +197,7 @@ def _pair_row(outcome: BatchOutcome, pair: PairAnswer) -> str:
         for value, digits in ((pair.overlap, 0), (report.get("confidence"), 0), (pair.missed, 2))
     ]
     names = [_text(outcome.scans[scan].file.name) for scan in (pair.source, pair.target)]
-    loops = "" if pair.belief is None else f"{pair.belief.agree} / {pair.belief.disagree}"
+    loops = "" if pair.loops is None else f"{pair.loops[0]} / {pair.loops[1]}"
     return (
         f"<tr><td class='name'><bdi>{names[0]}</bdi>--<br><bdi>{names[1]}</bdi>"
         f"<td class='n'>{shares[0]}<td class='n'>{shares[1]}<td class='n'>{loops}<td class='n'>{shares[2]}"

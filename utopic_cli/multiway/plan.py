@@ -122,6 +122,6 @@ def first_pairs(mode: str, scans: ScanList, usable: Sequence[int]) -> tuple[choi
     listed = ((original[a], original[b]) for a, b in choice.read_pairs(Path(mode), scans.scans))
     once: dict[frozenset[int], choice.Pair] = {}
     for pair in listed:
-        if len(set(pair)) == 2:
+        if len(set(pair)) == 2 and set(pair) <= set(usable):
             once.setdefault(frozenset(pair), pair)
     return tuple(once.values())

@@ -15,7 +15,7 @@ from utopic_cli.errors import InputError
 from utopic_cli.io.files import printable
 from utopic_cli.io.glance import problem_at_start, read_start
 from utopic_cli.io.scan import SUFFIXES
-from utopic_cli.multiway.aside import DOUBTFUL_SUFFIXES, Aside, said_of, why_no_scan
+from utopic_cli.multiway.aside import DOUBTFUL_SUFFIXES, Aside, said_of, scans_below, why_no_scan
 
 LONGEST_NAME = 80
 """Two names and ``--.json`` fit in any file system's file name."""
@@ -80,6 +80,9 @@ def find_scans(inputs: Sequence[Path]) -> ScanList:
         aside += left
         if left:
             notes.append(said_of(given, left))
+        below = scans_below(given) if given.is_dir() else None
+        if below is not None:
+            notes.append(below)
     once: dict[str, tuple[Path, bool]] = {}
     for path, doubtful in found:
         place = os.path.realpath(path)
@@ -90,6 +93,11 @@ def find_scans(inputs: Sequence[Path]) -> ScanList:
     if len(once) < 2:
         where = ", ".join(map(str, inputs))
         if once and not any(given.is_dir() for given in inputs):
+            (only,) = (path for path, _ in once.values())
+            problem = _problem(only) if only.is_file() else None
+            if problem is not None:
+                reason = problem.removeprefix(f"{only}: ")
+                raise InputError(f"{only}: is no scan ({reason}); a batch takes a folder or several scans")
             raise InputError(f"{where}: only one scan given; a batch needs at least two")
         count = "only one scan file" if once else "no scan files"
         needed = f"a batch needs at least two ({' '.join(SUFFIXES)})"
@@ -144,11 +152,11 @@ def _expanded(given: Path) -> tuple[list[tuple[Path, bool]], list[Aside]]:
     if not folder and os.path.lexists(given):
         return [(given, False)], []
     try:
-        inside = given.iterdir() if folder else map(Path, glob.glob(str(given), recursive=True))
+        inside = list(given.iterdir() if folder else map(Path, glob.glob(str(given), recursive=True)))
         files = sorted((path for path in inside if _is_seen(path)), key=natural_order)
     except OSError as error:
         raise InputError(f"{given}: can't be listed ({error.strerror}); check its permissions") from None
-    if not (folder or files):
+    if not (folder or inside):
         raise InputError(f"{given}: no such file or folder, and no file matches it; check the path")
     taken, aside = [], []
     for path in files:

@@ -110,8 +110,7 @@ def summary_csv(outcome: BatchOutcome) -> bytes:
                 group_of[pair.source] + 1 if together else "",
                 _number(pair.overlap),
                 _number(record["report"]["confidence"] if record["status"] == "done" else None),
-                pair.belief.agree if pair.belief else "",
-                pair.belief.disagree if pair.belief else "",
+                *(pair.loops or ("", "")),
                 _number(pair.missed),
                 f"{record['seconds']:.1f}",
                 pair.reason,
@@ -140,8 +139,8 @@ def _pair_entry(outcome: BatchOutcome, index: int) -> dict[str, Any]:
         "pair": outcome.pair_name(pair.source, pair.target),
         "verdict": pair.verdict,
         "reason": pair.reason,
-        "loops_agree": pair.belief.agree if pair.belief else None,
-        "loops_disagree": pair.belief.disagree if pair.belief else None,
+        "loops_agree": pair.loops[0] if pair.loops else None,
+        "loops_disagree": pair.loops[1] if pair.loops else None,
         "missed": pair.missed,
     }
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from utopic_cli.geometry.rigid import apply, invert, rotation_angle_deg
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import FreeMotion, RegistrationResult
+from utopic_cli.result_display import rounded
 
 
 @dataclass(frozen=True)
@@ -118,12 +119,13 @@ def _residual(result: RegistrationResult) -> str:
     if not math.isfinite(fit.inlier_rmse):
         return "not measured: no point has a counterpart"
     spread = ", ".join(
-        f"{'half' if name == 'p50' else name[1:] + '%'} under {length(value)}"
+        f"{'half' if name == 'p50' else name[1:] + '%'} under {length(rounded(value, 100 * fit.threshold))}"
         for name, value in fit.residual_percentiles.items()
         if name in ("p50", "p95")
     )
+    rmse = length(rounded(fit.inlier_rmse, 100 * fit.threshold))
     return (
-        f"{length(fit.inlier_rmse)} file units rms where the scans overlap ({spread}); "
+        f"{rmse} file units rms where the scans overlap ({spread}); "
         f"a counterpart is within {length(fit.threshold)}"
     )
 
