@@ -61,6 +61,12 @@ def test_options_reach_the_trainer(cli, trainer, tmp_path):
     assert len(call["train"]) == 9 and len(call["val"]) == 1
 
 
+def test_the_hint_to_calibrate_names_the_run_s_own_shapes(cli, trainer, tmp_path):
+    result = cli("train", "--data", tmp_path / "my shapes", "--out", tmp_path / "run")
+    weights = tmp_path / "run" / "utopic.safetensors"
+    assert f"utopic calibrate {weights} --data '{tmp_path}/my shapes'" in result.stderr
+
+
 def test_where_there_is_no_terminal_each_record_is_a_plain_line(cli, trainer, tmp_path):
     out = tmp_path / "run"
     result = cli("train", "--out", out)

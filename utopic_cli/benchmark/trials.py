@@ -101,6 +101,9 @@ def _half(shapes: ShapeLibrary, parity: int) -> ShapeLibrary:
     hashes = np.array([zlib.crc32(name.encode()) for name in library.names.tolist()])
     chosen = np.flatnonzero(hashes % 2 == parity)
     if not len(chosen):
-        raise InputError(f"the library's {len(library)} '{split}' shapes can't be halved; give more shapes")
+        raise InputError(
+            f"the library's {len(library)} '{split}' shapes can't be halved: a tenth of all shapes is held "
+            "out, so give a hundred or more"
+        )
     meshes = [library.mesh(int(i)) for i in chosen]
     return pack(meshes, library.names[chosen], library.splits[chosen], library.sets[chosen])

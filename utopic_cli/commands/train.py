@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -81,7 +82,8 @@ def train(
         place = choose_device(device)
         first = load_weights(start_from)[0].state_dict() if start_from else None
     shapes = load_library(data, console, resume)
-    console.line(f"training on {place} with {len(shapes)} shapes")
+    counts = {split: len(shapes.select(split)) for split in ("train", "val")}
+    console.line(f"training on {place} with {counts['train']} shapes, {counts['val']} more to validate")
     try:
         with TrainingView(console) as view:
             written = run_training(
@@ -100,7 +102,7 @@ def train(
     except InterruptedRun as stop:
         console.line(f"saved {out / RUN_FILES[0]} and exported {stop.weights}; go on: the same with --resume")
         raise
-    for line in (view.outcome(), *describe_files(out, written)):
+    for line in (view.outcome(), *describe_files(out, written, data)):
         console.line(line)
 
 
@@ -148,11 +150,12 @@ def load_library(data: str, console: Console, resume: bool = False) -> ShapeLibr
     return shapes
 
 
-def describe_files(out: Path, weights: Path) -> list[str]:
+def describe_files(out: Path, weights: Path, data: str) -> list[str]:
     """Say where everything is that a run left, one line each."""
+    library = f" --data {shlex.quote(data)}" if data != PROCEDURAL else ""
     lines = [
         f"wrote {weights}; use it: utopic align SOURCE TARGET --weights {weights}",
-        f"so that its answers can be trusted: utopic calibrate {weights}",
+        f"so that its answers can be trusted: utopic calibrate {weights}{library}",
     ]
     if (out / "curves.html").is_file():
         lines.append(f"curves: {out / 'curves.html'}")
