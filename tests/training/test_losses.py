@@ -18,6 +18,7 @@ from utopic_cli.training.losses import (
     descriptor_loss,
     overlap_loss,
     registration_loss,
+    reliability_loss,
     uncertainty_loss,
 )
 
@@ -193,3 +194,36 @@ def test_a_loss_is_a_mean_over_pairs():
         for i in (0, 1)
     ]
     assert float(descriptor_loss(similarity, torch.tensor(5.0), both)) == pytest.approx(float(sum(each)) / 2)
+
+
+def spread_out(variances: list[float]) -> OverlapDistribution:
+    """Two samples a point, that far apart."""
+    deviation = torch.tensor([variances]).sqrt()
+    samples = torch.stack([0.5 - deviation, 0.5 + deviation], dim=1)
+    nothing = torch.zeros_like(deviation)
+    return OverlapDistribution(nothing, nothing, samples, nothing)
+
+
+def test_reliability_loss_reads_the_variance_as_odds_of_a_wrong_match():
+    # Point 0 is matched rightly, 1 wrongly, 2 only near the border, 3 far from everything, 4 no point.
+    scores = torch.tensor([[[0.9, 0.1], [0.8, 0.2], [0.1, 0.9], [0.9, 0.1], [0.9, 0.1]]])
+    near = torch.tensor([[[1, 0], [0, 1], [0, 1], [0, 0], [1, 0]]]).bool()
+    overlap = torch.tensor([[1.0, 1, 0, 0, 1]])
+    valid = torch.tensor([[1.0, 1, 1, 1, 0]])
+    distribution = spread_out([0.02 / 3, 0.06, 0.18, 0.2, 0.2])  # odds 1/3, 3, 9
+    expected = -(math.log(3 / 4) + math.log(3 / 4) + math.log(9 / 10)) / 3
+    assert float(reliability_loss(distribution, scores, near, overlap, valid)) == pytest.approx(
+        expected, rel=1e-4
+    )
+    other = spread_out([0.06, 0.06, 0.18, 0.2, 0.2])
+    assert float(reliability_loss(other, scores, near, overlap, valid)) > expected + 0.3
+
+
+def test_reliability_loss_moves_the_variance_of_a_wrong_point_up():
+    mean, log_variance = torch.zeros(1, 1), torch.full((1, 1), -2.0, requires_grad=True)
+    noise = torch.randn(1, 50, 1, generator=torch.Generator().manual_seed(0))
+    samples = torch.sigmoid(mean[:, None] + noise * (0.5 * log_variance).exp()[:, None])
+    distribution = OverlapDistribution(mean, log_variance, samples, samples.var(dim=1))
+    scores, near = torch.tensor([[[0.9, 0.1]]]), torch.tensor([[[False, True]]])
+    reliability_loss(distribution, scores, near, torch.ones(1, 1), torch.ones(1, 1)).backward()
+    assert float(log_variance.grad) < 0

@@ -24,7 +24,7 @@ from utopic_cli.training.network import LossWeights, TrainingNetwork, total_loss
 from utopic_cli.training.processes import Processes, joined_processes
 
 ROOT = Path(__file__).resolve().parents[2]
-WEIGHTS = LossWeights(0.5, 1.0, 0.5, 1.0, 0.0, 0.1)  # without the one loss that draws at random
+WEIGHTS = LossWeights(0.5, 1.0, 0.5, 1.0, 0.0, 0.0, 0.1)  # without the two losses that draw at random
 
 
 def gradients(share: tuple[int, int], processes: Processes, stage: str) -> dict[str, torch.Tensor]:

@@ -105,6 +105,7 @@ class LossSettings:
     coarse: float = 0.5
     overlap: float = 1.0
     uncertainty: float = 1.0
+    reliability: float = 0.5
     completion: float = 0.1
     completion_points: int = 128
     correspondence_radius: float = 0.0

@@ -35,7 +35,7 @@ TOGETHER = (("hit_rate", "match_rate", "inlier_ratio"), ("overlap_accuracy", "kn
 TABLE = ("validation", "loss", "optimiser", "speed")
 """Order of the kinds in the table of last values."""
 
-SHARES = ("_rate", "_ratio", "_accuracy", "_recall", "waiting")
+SHARES = ("_rate", "_ratio", "_accuracy", "_recall", "_auc", "waiting")
 """Endings of names whose values are shares of one."""
 
 

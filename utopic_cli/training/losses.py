@@ -1,4 +1,4 @@
-"""The four losses of the paper (Sec. 3.5) and the descriptors' contrastive loss.
+"""The four losses of the paper (Sec. 3.5), the descriptors' contrastive loss, and reliability.
 
 Every loss is a mean over pairs of a mean within the pair, so that it does not matter which
 pairs share a batch, or a process.
@@ -12,6 +12,9 @@ from torch.nn.functional import binary_cross_entropy, binary_cross_entropy_with_
 
 from utopic_cli.model.uncertainty import OverlapDistribution
 from utopic_cli.training.labels import Labels
+
+EVEN_VARIANCE = 0.02
+"""Raw uncertainty of a point that is as likely matched rightly as wrongly."""
 
 
 def descriptor_loss(similarity: Tensor, temperature: Tensor, labels: Labels) -> Tensor:
@@ -69,6 +72,32 @@ def uncertainty_loss(
     mean, log_variance = distribution.mean, distribution.log_variance
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance)
     return _mean(0.5 * fit + kl_weight * divergence, valid)
+
+
+def reliability_loss(
+    distribution: OverlapDistribution, scores: Tensor, near: Tensor, overlap: Tensor, valid: Tensor
+) -> Tensor:
+    """Teach the raw uncertainty to tell points that are matched wrongly: cross entropy of its odds.
+
+    The paper's loss leaves the variance of a sure point to the Kullback-Leibler term, so that it
+    follows the mean and says little of its own. Here the variance over ``EVEN_VARIANCE`` is read as the odds
+    that the point's best match is wrong: it has to be high where the surface shows nothing to go
+    by, and at the border, where a counterpart is near but none is right. Points far from any counterpart
+    take no part: about their match there is nothing to know.
+
+    Args:
+        distribution: of one cloud, N points and K samples.
+        scores: (B, N, M) soft correspondences to the other cloud.
+        near: (B, N, M) bool, pairs of real points that show about the same place.
+        overlap: (B, N) in {0, 1}.
+        valid: (B, N) float, 0 for points that only fill a batch up.
+    """
+    variance = distribution.samples.var(dim=1, unbiased=False)
+    best = scores.detach().argmax(dim=2, keepdim=True)
+    wrong = 1.0 - near.gather(2, best)[:, :, 0].float() * overlap
+    odds = (variance.clamp_min(1e-6) / EVEN_VARIANCE).log()
+    terms = binary_cross_entropy_with_logits(odds, wrong, reduction="none")
+    return _mean(terms, near.any(dim=2).float() * valid)
 
 
 def chamfer_loss(predicted: Tensor, expected: Tensor, valid: Tensor) -> Tensor:

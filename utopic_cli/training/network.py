@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from utopic_cli.config import ModelConfig
 from utopic_cli.model.cloud_input import CloudInput
-from utopic_cli.model.utopic import Utopic
+from utopic_cli.model.utopic import Prediction, Utopic
 from utopic_cli.training.completion import CompletionDecoder, canonical_frame
 from utopic_cli.training.labels import Labels, label_pair
 from utopic_cli.training.losses import (
@@ -18,6 +18,7 @@ from utopic_cli.training.losses import (
     descriptor_loss,
     overlap_loss,
     registration_loss,
+    reliability_loss,
     uncertainty_loss,
 )
 
@@ -41,13 +42,17 @@ class TrainingPair(NamedTuple):
 
 
 class LossWeights(NamedTuple):
-    """Weights of the loss terms; the paper's are 1 except ``descriptor`` and ``coarse`` (0)."""
+    """Weights of the loss terms; the paper's are 1 except those it does not have.
+
+    It has no ``descriptor``, no ``coarse`` and no ``reliability``.
+    """
 
     descriptor: float
     registration: float
     coarse: float
     overlap: float
     uncertainty: float
+    reliability: float
     completion: float
 
 
@@ -103,11 +108,32 @@ class TrainingNetwork(nn.Module):
             )
             + uncertainty_loss(prediction.target_distribution, labels.target_overlap, labels.target_valid),
         }
+        if self.inference.config.uncertainty_scheme != "none":
+            terms["reliability"] = self._reliability_loss(prediction, labels)
         if completion:
             terms["completion"] = self._completion_loss(
                 pair, labels, prediction.source_features, forward=True
             ) + self._completion_loss(pair, labels, prediction.target_features, forward=False)
         return terms
+
+    @staticmethod
+    def _reliability_loss(prediction: Prediction, labels: Labels) -> Tensor:
+        """Of both clouds, by the correspondences that are found from the features that tell it."""
+        scores = prediction.coarse_scores[:, :-1, :-1]
+        real = (labels.source_valid[:, :, None] * labels.target_valid[:, None]) > 0
+        near = real & ((labels.correspondences > 0) | labels.ignored)
+        return 0.5 * (
+            reliability_loss(
+                prediction.source_distribution, scores, near, labels.source_overlap, labels.source_valid
+            )
+            + reliability_loss(
+                prediction.target_distribution,
+                scores.transpose(1, 2),
+                near.transpose(1, 2),
+                labels.target_overlap,
+                labels.target_valid,
+            )
+        )
 
     def _completion_loss(
         self, pair: TrainingPair, labels: Labels, features: Tensor, *, forward: bool

@@ -40,10 +40,19 @@ def validate(
         lies within reach of the true place; ``match_rate``: the same for the final matching
         scores; ``inlier_ratio``: share of right ones among the 250 surest matches;
         ``overlap_accuracy``: share of points whose overlap is told right at 0.5;
-        ``known_overlap_accuracy``: the same when shown the right transformation.
+        ``known_overlap_accuracy``: the same when shown the right transformation;
+        ``uncertainty_auc``: probability, when shown it, that an overlapping source point whose best
+        match is wrong is more uncertain than one whose is right (one half where all are alike).
     """
     model.eval()
-    names = ("hit_rate", "match_rate", "inlier_ratio", "overlap_accuracy", "known_overlap_accuracy")
+    names = (
+        "hit_rate",
+        "match_rate",
+        "inlier_ratio",
+        "overlap_accuracy",
+        "known_overlap_accuracy",
+        "uncertainty_auc",
+    )
     sums = dict.fromkeys(names[:1] if descriptors_only else names, 0.0)
     for number, pair in enumerate(pairs):
         if descriptors_only:
@@ -70,7 +79,19 @@ def validate(
                 pair.source, pair.target, generator=generator, hypothesis=pair.gt_T_target_source
             )
         sums["known_overlap_accuracy"] += _overlap_accuracy(prediction, labels)
+        chosen = prediction.matching_scores[0, :-1, :-1].argmax(dim=1, keepdim=True)
+        right = error.gather(1, chosen)[:, 0] < 2.0 * POSITIVE_REACH
+        raw = prediction.source_distribution.raw_uncertainty[0]
+        sums["uncertainty_auc"] += _share_above(raw[overlapping & ~right], raw[overlapping & right])
     return {name: value / max(len(pairs), 1) for name, value in sums.items()}
+
+
+def _share_above(high: Tensor, low: Tensor) -> float:
+    """Share of all pairs of values in which the first is above the second, ties counting half."""
+    if not (len(high) and len(low)):
+        return 0.5
+    difference = high[:, None] - low
+    return float(((difference > 0).float() + 0.5 * (difference == 0).float()).mean())
 
 
 def _overlap_accuracy(prediction: Prediction, labels: Labels) -> float:
