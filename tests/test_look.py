@@ -11,7 +11,9 @@ from utopic_cli.bridge import NetworkView
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.candidates import Candidate
 from utopic_cli.estimation.evidence import SAME
+from utopic_cli.estimation.meeting import Meeting
 from utopic_cli.estimation.solver import Estimate
+from utopic_cli.estimation.surface import Surface, make_surface
 from utopic_cli.geometry import rigid
 from utopic_cli.look import Look, look, look_both_sides
 from utopic_cli.point_cloud import PointCloud
@@ -30,7 +32,9 @@ def answering(prepared: PreparedPair, score: float, rival: float | None, support
     """A look whose answer and rival have these scores, all else alike."""
 
     def candidate(value: float, T: np.ndarray) -> Candidate:
-        return Candidate(T, value, value, 0.0, "consensus", support, 0.5)
+        # Three times as plausible as it scores, all else alike: its standing is its score.
+        meeting = Meeting(1.0, 1.0, 1.0, 3.0 * value, 0.0, 0.0, 0.0, 0.0, 100)
+        return Candidate(T, value, value, 0.0, "consensus", support, meeting)
 
     turn = rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 0.0, 2.0])), np.zeros(3))
     rivals = () if rival is None else (candidate(rival, turn),)
@@ -38,7 +42,11 @@ def answering(prepared: PreparedPair, score: float, rival: float | None, support
     nobody = Correspondences(empty, empty, np.empty(0))
     estimate = Estimate(candidate(score, np.eye(4)), rivals, 40, nobody, "consensus")
     view = blind(prepared)
-    return Look(prepared, view, estimate)
+    return Look(prepared, view, estimate, surfaces_of(prepared))
+
+
+def surfaces_of(prepared: PreparedPair) -> tuple[Surface, Surface]:
+    return tuple(make_surface(scan.dense, 0.05) for scan in (prepared.source, prepared.target))  # type: ignore[return-value]
 
 
 def blind(prepared: PreparedPair) -> NetworkView:

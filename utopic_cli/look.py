@@ -12,6 +12,7 @@ from utopic_cli.errors import InputError
 from utopic_cli.estimation.evidence import SAME
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import Estimate, solve
+from utopic_cli.estimation.surface import Surface
 from utopic_cli.geometry import rigid
 from utopic_cli.preprocess import PreparedPair
 
@@ -40,12 +41,14 @@ class Look:
         prepared: the sampled pair.
         view: what was seen in it.
         estimate: what the robust solve made of that, in normalised units.
+        surfaces: the source's and the target's, as the solve took them.
         inside_out: whether the source's normals were reversed.
     """
 
     prepared: PreparedPair
     view: NetworkView
     estimate: Estimate
+    surfaces: tuple[Surface, Surface]
     inside_out: bool = False
 
     @property
@@ -112,7 +115,7 @@ def look(see: See, prepared: PreparedPair, solver: str = "auto", initial: np.nda
         estimate = solve(problem, solver, None if initial is None else prepared.normalise(initial))
     except ValueError as error:
         raise InputError(f"no transformation can be found between these scans: {error}") from error
-    return Look(prepared, view, estimate)
+    return Look(prepared, view, estimate, problem.surfaces)
 
 
 def look_both_sides(

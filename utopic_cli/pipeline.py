@@ -16,9 +16,8 @@ from utopic_cli.config import SOLVERS, AlignOptions, OptionValues
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.evidence import SAME, Seen, collect_evidence
 from utopic_cli.estimation.observability import Twists, find_twists, observe
-from utopic_cli.estimation.problem import working_voxel
 from utopic_cli.estimation.refinement import refine
-from utopic_cli.estimation.surface import make_surface, point_spacing
+from utopic_cli.estimation.surface import point_spacing
 from utopic_cli.estimation.verification import measure_fit
 from utopic_cli.frame import extent, find_frame
 from utopic_cli.geometry import rigid
@@ -158,10 +157,9 @@ def _register(
     ]
     threshold = COUNTERPART_REACH * max(spacings)
     fit = measure_fit(source, target, transformation, threshold, estimate.support, trees=trees)
-    voxel = working_voxel(prepared.source.dense, prepared.target.dense, prepared.spacing)
-    surfaces = make_surface(prepared.source.dense, voxel), make_surface(prepared.target.dense, voxel)
+    surfaces = answer.surfaces
     twists = find_twists(*surfaces, normalised)
-    observability = None if twists is None else _observe(prepared, twists, voxel)
+    observability = None if twists is None else _observe(prepared, twists, surfaces[1].voxel)
     signals = collect_evidence(
         *surfaces, normalised, estimate, _seen(prepared, view), fit, twists, spread
     ).as_dict()

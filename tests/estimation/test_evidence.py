@@ -123,7 +123,7 @@ def test_a_rival_as_good_as_the_answer_takes_the_lead_away(
         T_target_source=estimate.T_target_source,
         score=estimate.score,
         support=estimate.support,
-        plausibility=estimate.best.plausibility,
+        meeting=estimate.best.meeting,
     )
     problem = make_problem(*scans, gt_transformation, wrong=0.5)
     doubtful = evidence_of(problem, scans, dataclasses.replace(estimate, rivals=(twin,)))

@@ -7,6 +7,7 @@ import pytest
 
 from tests.estimation.conftest import VOXEL, make_problem
 from utopic_cli.estimation.candidates import Candidate
+from utopic_cli.estimation.meeting import Meeting
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import Estimate, solve
 from utopic_cli.geometry import rigid
@@ -132,13 +133,20 @@ def test_input_that_fits_no_problem_is_refused(hard_problem: Problem) -> None:
 
 
 def test_standing_prefers_what_agrees_where_it_meets_over_what_covers_more() -> None:
-    def candidate(score: float, plausibility: float, support: float) -> Candidate:
-        return Candidate(np.eye(4), score, score, 0.0, "consensus", support, plausibility)
+    def candidate(score: float, likeness: float, share: float, support: float, **more: float) -> Candidate:
+        meeting = replace(Meeting(share, share, 0.8, likeness, 0.08, 0.03, 0.0, 0.0, 900), **more)
+        return Candidate(np.eye(4), score, score, 0.0, "consensus", support, meeting)
 
-    roughly_over_everything = candidate(0.44, 0.48, 0.065)
-    exactly_over_a_part = candidate(0.39, 0.59, 0.12)
+    roughly_over_everything = candidate(0.44, 0.6, 0.64, 0.065)
+    exactly_over_a_part = candidate(0.39, 0.98, 0.36, 0.12)
     assert exactly_over_a_part.standing > roughly_over_everything.standing
-    assert candidate(0.4, 0.5, 0.0).standing == candidate(0.4, 0.5, 1e-9).standing
+    assert candidate(0.4, 0.8, 0.5, 0.0).standing == candidate(0.4, 0.8, 0.5, 1e-9).standing
+    # Half a turn off, a nearly symmetric thing covers more, but lies less close.
+    turned, right = candidate(0.5, 0.9, 0.7, 0.05, tightness=0.13), candidate(0.45, 0.9, 0.6, 0.05)
+    assert right.standing > turned.standing
+    flat, shaped = candidate(0.5, 0.9, 0.7, 0.05, turning=0.0), candidate(0.5, 0.9, 0.7, 0.05, turning=0.1)
+    assert shaped.standing > flat.standing
+    assert candidate(0.5, 0.9, 0.7, 0.05, conflict=0.1).standing < roughly_over_everything.standing
 
 
 def test_two_estimates_of_one_pair_are_joined(

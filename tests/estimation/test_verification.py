@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import VOXEL, lumpy_surface
-from utopic_cli.estimation.surface import DepthMap, make_surface, point_spacing, thinned
+from utopic_cli.estimation.depth_map import DepthMap
+from utopic_cli.estimation.surface import make_surface, point_spacing, thinned
 from utopic_cli.estimation.verification import measure_fit, verify
 from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from utopic_cli.estimation.consensus import Hypothesis, distinct
-from utopic_cli.estimation.meeting import meet, self_agreement
+from utopic_cli.estimation.meeting import Meeting, meet, self_agreement
 from utopic_cli.estimation.partners import (
     BEYOND_CHANCE,
     approach_partners,
@@ -27,6 +27,8 @@ REFINED = 8  # measured: what ranks lower after screening never turns out best
 REFINED_SPARSE = 30  # partners may yet speak for it
 APPROACHED = 3
 LEAST_SUPPORT = 1e-3  # of the correspondences' weight: less is the same
+MOST_TURNING = 0.5  # beyond it, normals contradict each other
+MOST_CONFLICT = 0.3
 SCREENING = (Stage(5.0, 6, 250), Stage(3.0, 4, 250))
 COARSE = (Stage(3.0, 8, 1000), Stage(1.2, 8, 1000))
 
@@ -42,7 +44,7 @@ class Candidate:
         violation: share of points that stand where the other scan saw free space.
         origin: ``consensus``, ``assignment`` or ``initial``.
         support: share of the correspondences' weight that it explains.
-        plausibility: how well the surfaces agree where they meet; see ``Meeting``.
+        meeting: how the surfaces lie on each other; None until it is weighed.
     """
 
     T_target_source: np.ndarray
@@ -51,18 +53,35 @@ class Candidate:
     violation: float
     origin: str
     support: float = 0.0
-    plausibility: float = 0.0
+    meeting: Meeting | None = None
+
+    @property
+    def plausibility(self) -> float:
+        """How well the surfaces agree where they meet; see ``Meeting``. 0 until it is weighed."""
+        return 0.0 if self.meeting is None else self.meeting.plausibility
 
     @property
     def standing(self) -> float:
-        """What candidates are ranked by in the end: score, plausibility and support together.
+        """What candidates are ranked by in the end.
 
         The score alone likes a wrong transformation that lays much of one scan roughly on the other
-        better than a right one of scans that share little. The weights were chosen on simulated
-        scans of shapes held out from training; half or twice of each does about as well.
+        (a nearly symmetric thing, half a turn off) better than a right one of scans that share little.
+        The right one lies closer; that speaks the more for it the more the surfaces turn where they
+        meet, since flat on flat is always close; and it hardly ever puts one scan where the other saw
+        nothing.
         """
         support = np.log10(max(self.support, LEAST_SUPPORT))
-        return float(self.score + 0.5 * self.plausibility + 0.1 * support)
+        if self.meeting is None:
+            return float(0.25 * self.score + 0.125 * support)
+        shape = min(self.meeting.turning, MOST_TURNING)
+        conflict = min(self.meeting.conflict, MOST_CONFLICT)
+        return float(
+            0.25 * (self.score + self.meeting.plausibility)
+            + 0.125 * support
+            - 2.25 * self.meeting.tightness
+            + 0.3 * shape
+            - 0.75 * conflict
+        )
 
 
 def screen(
@@ -145,13 +164,18 @@ def weigh(
     source: Surface,
     target: Surface,
 ) -> list[Candidate]:
-    """Add to each candidate what its standing needs: plausibility and support."""
+    """Add to each candidate what its standing needs: how the surfaces meet, and support.
+
+    The weights in ``Candidate.standing`` were fitted to the candidates of 234 simulated pairs (range
+    scans of training shapes, rooms, solids) and looked at on 89 pairs of other shapes: right ones came
+    first in 214 instead of 192, and in 83 instead of 71.
+    """
     total = max(float(correspondences.weights.sum()), 1e-300)
     alike = self_agreement(source, target)
     return [
         replace(
             candidate,
-            plausibility=meet(source, target, candidate.T_target_source, alike).plausibility,
+            meeting=meet(source, target, candidate.T_target_source, alike),
             support=float(
                 explained(problem, correspondences, candidate.T_target_source, tolerance).weights.sum()
                 / total

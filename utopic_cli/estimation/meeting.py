@@ -134,5 +134,5 @@ def _one_way(moving: Surface, fixed: Surface, T: np.ndarray) -> _Way:
         agreed=int(agreed.sum()),
         beside=beside[agreed],
         turning=1.0 - cosine,
-        violation=float(fixed.depth_map.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean()),
+        violation=float(fixed.sight.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean()),
     )

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from utopic_cli.estimation.surface import point_spacing
+from utopic_cli.estimation.surface import Surface, make_surface, point_spacing
 from utopic_cli.geometry import rigid
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.result import Correspondences
@@ -43,6 +44,12 @@ class Problem:
     source_dense: PointCloud
     target_dense: PointCloud
     spacing: float
+
+    @cached_property
+    def surfaces(self) -> tuple[Surface, Surface]:
+        """The source's and the target's dense points made ready, at the working voxel."""
+        voxel = working_voxel(self.source_dense, self.target_dense, self.spacing)
+        return make_surface(self.source_dense, voxel), make_surface(self.target_dense, voxel)
 
 
 def working_voxel(source: PointCloud, target: PointCloud, spacing: float) -> float:

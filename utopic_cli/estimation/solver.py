@@ -13,9 +13,9 @@ from utopic_cli.estimation.correspondences import (
     linear_assignment,
     overlap_weights,
 )
-from utopic_cli.estimation.problem import Problem, check_problem, explained, working_voxel
+from utopic_cli.estimation.problem import Problem, check_problem, explained
 from utopic_cli.estimation.procrustes import weighted_procrustes
-from utopic_cli.estimation.surface import Surface, make_surface
+from utopic_cli.estimation.surface import Surface
 from utopic_cli.result import Correspondences
 
 CONSENSUS_TOLERANCE = 2.5  # voxels
@@ -109,8 +109,8 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
     if solver not in ("auto", "svd", "consensus"):
         raise ValueError(f"unknown solver {solver!r}; expected auto, svd or consensus")
     check_problem(problem, initial)
-    voxel = working_voxel(problem.source_dense, problem.target_dense, problem.spacing)
-    source, target = make_surface(problem.source_dense, voxel), make_surface(problem.target_dense, voxel)
+    source, target = problem.surfaces
+    voxel = target.voxel
     candidates = _weighted_candidates(problem)
     hypotheses: list[Hypothesis] = []
     if initial is not None:

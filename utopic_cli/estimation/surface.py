@@ -3,53 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
+from utopic_cli.estimation.depth_map import DepthMap
+from utopic_cli.estimation.panorama import Panorama, find_standpoint
 from utopic_cli.geometry.nearest import nearest
 from utopic_cli.point_cloud import PointCloud
-
-MOST_PIXELS = 2000
-"""Most pixels of a depth map along a side."""
-
-
-class DepthMap:
-    """What a scan saw, as an orthographic image: the nearest surface along each line of sight.
-
-    A scanner that saw a surface also saw that nothing stood before it. The line of sight is
-    not in the file; the mean oriented normal points back at the scanner well enough, since a
-    scanner sees only surfaces that face it.
-    """
-
-    def __init__(self, points: np.ndarray, normals: np.ndarray, pitch: float) -> None:
-        """Render (N, 3) points with (N, 3) oriented normals at ``pitch`` units a pixel."""
-        mean = normals.mean(axis=0)
-        length = np.linalg.norm(mean)
-        towards = mean / length if length > 0 else np.array([0.0, 0.0, 1.0])
-        helper = np.eye(3)[np.abs(towards).argmin()]
-        across = np.cross(towards, helper)
-        across /= np.linalg.norm(across)
-        self.axes = np.stack([across, np.cross(towards, across), towards])  # rows: x, y, towards the scanner
-        seen = points @ self.axes.T
-        # However few points are spread however far, the image stays small.
-        self.pitch = pitch = max(pitch, float(np.ptp(seen[:, :2], axis=0).max()) / MOST_PIXELS)
-        self.corner = seen[:, :2].min(axis=0) - 2.0 * pitch
-        column, row = np.floor((seen[:, :2] - self.corner) / pitch).astype(np.int64).T
-        front = np.full((column.max() + 3, row.max() + 3), -np.inf)
-        np.maximum.at(front, (column, row), seen[:, 2])
-        # The nearest surface around each pixel: closes gaps between samples and spares steep walls.
-        widened = maximum_filter(front, size=3, mode="constant", cval=-np.inf)
-        self.front = np.where(np.isneginf(widened), np.inf, widened)  # nothing seen: nothing known
-
-    def in_front(self, points: np.ndarray, margin: float) -> np.ndarray:
-        """Tell which (..., 3) points the scanner would have seen before its surface -> (...) bool."""
-        seen = points @ self.axes.T
-        pixel = np.floor((seen[..., :2] - self.corner) / self.pitch).astype(np.int64)
-        inside = ((pixel >= 0) & (pixel < self.front.shape)).all(axis=-1)
-        pixel = np.where(inside[..., None], pixel, 0)  # the corner pixel is always empty
-        return seen[..., 2] > self.front[pixel[..., 0], pixel[..., 1]] + margin
 
 
 def thinned(points: np.ndarray, limit: int) -> np.ndarray:
@@ -86,6 +48,13 @@ def point_spacing(points: np.ndarray, tree: cKDTree | None = None) -> float:
     return spacing
 
 
+PITCH = 1.5
+"""Voxels to a pixel, or a cell, of what a scan saw past."""
+
+ONE_SIDED = 0.9
+"""Share of points that face one direction from which on a scan counts as taken from there."""
+
+
 @dataclass(frozen=True)
 class Surface:
     """A dense scan made ready for registration.
@@ -96,7 +65,6 @@ class Surface:
         voxel: v, the sampling distance that tolerances are multiples of.
         sample: indices of about ``SAMPLE`` points spread evenly over the scan.
         tree: nearest-neighbour search over ``points``.
-        depth_map: what the scan saw past.
     """
 
     points: np.ndarray
@@ -104,7 +72,15 @@ class Surface:
     voxel: float
     sample: np.ndarray
     tree: cKDTree
-    depth_map: DepthMap
+
+    @cached_property
+    def sight(self) -> DepthMap | Panorama:
+        """What the scan saw past: as seen from one side, or else from a place within it, if there is one."""
+        from_a_side = DepthMap(self.points, self.normals, PITCH * self.voxel)
+        if from_a_side.facing >= ONE_SIDED:
+            return from_a_side
+        standpoint = find_standpoint(self.points, self.normals)
+        return from_a_side if standpoint is None else Panorama(self.points, standpoint, PITCH * self.voxel)
 
 
 SAMPLE = 1000
@@ -133,5 +109,4 @@ def make_surface(cloud: PointCloud, voxel: float) -> Surface:
         voxel=voxel,
         sample=sample,
         tree=cKDTree(cloud.points),
-        depth_map=DepthMap(cloud.points, cloud.normals, 1.5 * voxel),
     )

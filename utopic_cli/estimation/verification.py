@@ -83,7 +83,7 @@ def _one_way(
     beside = np.abs(np.einsum("hsd,hsd->hs", fixed.points[index] - moved, plane))
     agreement = np.einsum("hsd,hsd->hs", turned, plane)
     fit = (found & (beside < CLOSE * fixed.voxel) & (agreement > AGREEING)).mean(axis=1)
-    violation = fixed.depth_map.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean(axis=1)
+    violation = fixed.sight.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean(axis=1)
     return fit, violation
 
 
