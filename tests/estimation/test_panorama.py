@@ -49,6 +49,7 @@ def test_the_standpoint_of_a_room_is_found_whichever_side_its_normals_show() -> 
         found = find_standpoint(points, sign * normals)
         assert found is not None
         assert np.linalg.norm(found - STANDPOINT) < ROUGHLY
+    assert find_standpoint(points[::6], normals[::6]) is None  # one could see through such walls
 
 
 def test_the_standpoint_moves_with_the_scan() -> None:

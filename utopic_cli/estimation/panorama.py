@@ -18,6 +18,9 @@ FACING = 0.85
 HIDDEN = 0.05
 """Most of a scan that may lie hidden behind the rest, seen from its standpoint; see ``_hidden``."""
 
+FEWEST_POINTS = 2000
+"""Fewer can't tell what hides what: between them one sees through any surface."""
+
 GRID = 7
 """Places tried along each axis of the scan's box."""
 
@@ -59,8 +62,11 @@ def find_standpoint(points: np.ndarray, normals: np.ndarray) -> np.ndarray | Non
             standpoint does not matter.
 
     Returns:
-        (3,), or None where there is no such place: the scan was taken from outside, or merged of several.
+        (3,), or None where there is no such place (the scan was taken from outside, or merged of several), or
+        where fewer than ``FEWEST_POINTS`` can't tell.
     """
+    if len(points) < FEWEST_POINTS:
+        return None
     middle = points.mean(axis=0)
     axes = np.linalg.eigh((points - middle).T @ (points - middle))[1]  # so a scan's pose makes no difference
     points, normals = (points - middle) @ axes, normals @ axes
