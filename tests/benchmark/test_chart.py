@@ -40,6 +40,19 @@ def test_lines_beyond_the_looks_are_left_to_the_tables() -> None:
     assert drawn.count("<polyline") == 1
 
 
+def test_one_point_is_seen_though_no_line_goes_through_it() -> None:
+    chart = Chart("name", "x", "y")
+    chart.line([(0.5, 0.5)], "curve")
+    (place,) = re.findall(r'<circle class="curve" cx="([\d.]+)" cy="([\d.]+)"', chart.svg())
+    assert place == ("226.0", "155.0") and "<polyline" not in chart.svg()
+
+
+def test_a_plot_without_values_says_so() -> None:
+    assert "no answers" in value_plot("name", "caption", ("x", "y"), {"one": []}, 1.0)
+    drawn = value_plot("name", "caption", ("x", "y"), {"one": [(0.0, 0.0)]}, 1.0)
+    assert "no answers" not in drawn and '<circle class="place s0"' in drawn
+
+
 @pytest.mark.parametrize("template", ["result_page.html", "trust_page.html"])
 def test_pages_share_one_head(template: str) -> None:
     body = resource("utopic_cli.benchmark", template)

@@ -192,13 +192,33 @@ def test_the_sweep_is_also_told_by_the_overlap_of_each_pair() -> None:
     assert len(report.tables()) == 2 and page(report).count("<svg") == 3
 
 
-def test_a_tiny_run_ends_in_a_curve(shapes: ShapeLibrary) -> None:
+@pytest.mark.parametrize(
+    ("name", "places"),
+    [
+        ("noise", [0.0, 0.005]),
+        ("density", [1.0, 2.0]),
+        ("outliers", [0.0, 0.05]),
+        ("rotation", [0.0, 30.0]),
+        ("overlap-sweep", None),
+    ],
+)
+def test_a_tiny_run_ends_in_a_curve(shapes: ShapeLibrary, name: str, places: list[float] | None) -> None:
+    sweep = places is None
+    protocol = SweepProtocol() if sweep else CurveProtocol(name=name, pairs=FEW)
     told = []
     report = run(
-        CurveProtocol(name="outliers", pairs=FEW), shapes, "test", pairs=2, weights=(), baselines=("fpfh",),
-        points=200, progress=lambda *words: told.append(words),
+        protocol, shapes, "test", pairs=2, weights=(), baselines=("fpfh",), points=200,
+        progress=lambda *words: told.append(words),
     )  # fmt: skip
-    assert isinstance(report, CurveReport)
-    assert [place for place, _ in report.curve()["fpfh", REFINED]] == [0.0, 0.05]
+    assert isinstance(report, CurveReport) and report.settings["protocol"]["name"] == name
+    found = [place for place, _ in report.curve()["fpfh", REFINED]]
+    assert (len(found) == 2 and 1 > found[0] > found[1] > 0.3) if sweep else found == places
     assert told[-1][:2] == (2, 2)
-    assert "Success" in page(report)
+    assert page(report).count('class="place s0"') >= 2
+
+
+def test_a_curve_with_one_step_shows_it() -> None:
+    whole = _report("noise", ("0", "0.01"), [0.0, 0.01])
+    first = CurveReport(whole.settings, whole.groups, whole.answers[:2])
+    assert [len(points) for points in first.curve().values()] == [1, 1]
+    assert page(first).count('class="place s0"') == 2 and "no answers" not in page(first)

@@ -14,8 +14,9 @@ import pytest
 from rich.console import Console
 
 from tests.benchmark.conftest import ScanFolder
-from utopic_cli.benchmark.method import Trial
+from utopic_cli.benchmark.method import Trial, Utopic
 from utopic_cli.benchmark.scans import render, run, run_methods, start_transformation
+from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.geometry.rigid import apply, invert, is_rigid, rigid, rotation_angle_deg
 
@@ -147,6 +148,14 @@ def test_methods_share_trials_and_the_report_says_everything(folder: ScanFolder)
     text = io.StringIO()
     render(report, Console(file=text, width=120))
     assert "2/2 (100%)" in text.getvalue() and "0/2 (0%)" in text.getvalue()
+
+
+def test_the_title_names_the_weights(folder: ScanFolder) -> None:
+    settings = Utopic(AlignOptions()).settings()
+    report = run_methods((FakeMethod(oracle(folder)),), folder.path, poses=1)
+    assert "weights" not in report.title and "1 pair x 1 start pose, seed 0" in report.title
+    report.settings["methods"]["utopic"] = settings
+    assert report.title.endswith(f"seed 0, weights utopic (sha256 {settings['weights_sha256'][:12]})")
 
 
 def test_a_rough_estimate_is_refined_unless_the_method_does_so_itself(folder: ScanFolder) -> None:

@@ -21,8 +21,8 @@ from utopic_cli.synthesis.procedural import procedural_mesh
 from utopic_cli.synthesis.shapes import ShapeLibrary, pack
 
 SETTINGS = {
-    "weights": "utopic", "data": "test", "split": "val", "shapes": 2, "pairs": 2, "seed": 0,
-    "points": [100, 200],
+    "weights": "utopic", "weights_sha256": "ab" * 32, "data": "test", "split": "val", "shapes": 2, "pairs": 2,
+    "seed": 0, "points": [100, 200],
 }  # fmt: skip
 MEASURED = Measurement(
     ALIGN, 100, 1, "cpu", 2, 90.0, 2.0, 1.5, 0.01, 400_000_000, 300_000_000, 2, {"refine": 0.1}
@@ -82,6 +82,8 @@ def test_the_report_is_told_in_tables_json_and_page() -> None:
     said = out.getvalue()
     assert "REGTR (quoted)" in said and "0.29 / 0.23" in said and "RTX 2080 Ti" in said
     assert "0.50%" in said and "2/2" in said and "batch 4, cpu: left out" in said and "400" in said
+    assert report.title.endswith("seed 0, weights utopic (sha256 abababababab)")
+    assert report.title in said and report.title in page(report).replace("&#x27;", "'")
     rows = json.loads(report.to_json())["measurements"]
     assert [row["pairs_per_second"] for row in rows] == [2.0, None, 0.5]
     text = page(report)
@@ -89,7 +91,13 @@ def test_the_report_is_told_in_tables_json_and_page() -> None:
 
 
 def test_what_cant_be_measured(shapes: ShapeLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
-    for asked in ({"points": (10,)}, {"points": ()}, {"pairs": 0}, {"baselines": ("magic",)}):
+    for asked in (
+        {"points": (10,)},
+        {"points": ()},
+        {"pairs": 0},
+        {"batches": (0,)},
+        {"baselines": ("magic",)},
+    ):
         with pytest.raises(UsageError):
             run(shapes, "test", **asked)
     with pytest.raises(InputError, match="nowhere"):
@@ -106,9 +114,9 @@ def test_a_tiny_run_measures_network_alignment_and_a_baseline(
 ) -> None:
     pytest.importorskip("open3d")
     monkeypatch.setattr(speed, "CLEAN", replace(speed.CLEAN, points=(1500, 1500)))
-    report = run(shapes, "test", 1, points=(100,), baselines=("open3d-ransac",), device="cpu")
+    report = run(shapes, "test", 1, points=(100,), baselines=("open3d-ransac",), device="cpu", batches=(1, 3))
     assert [(one.what, one.batch) for one in report.measurements] == [
-        (FORWARD, 1), (FORWARD, 4), (ALIGN, 1), ("open3d-ransac", 1),
+        (FORWARD, 1), (FORWARD, 3), (ALIGN, 1), ("open3d-ransac", 1),
     ]  # fmt: skip
     assert not report.losses()
     for one in report.measurements:

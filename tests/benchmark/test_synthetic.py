@@ -145,6 +145,23 @@ def test_a_tiny_run_on_range_scans(shapes: ShapeLibrary) -> None:
     check_report(run(SCANS, shapes, "tiny", **OPTIONS), SCANS)
 
 
+@pytest.mark.parametrize(
+    "protocol",
+    [
+        CropProtocol("modelonet", 0.5, "shared", "euler45"),
+        CropProtocol("scanobjectnn", 0.7, "shared", "euler45"),
+        CropProtocol("detail", 0.7, "independent", "uniform", points=5000, relief=0.04),
+    ],
+    ids=lambda protocol: protocol.name,
+)
+def test_a_tiny_run_of_the_other_crops(shapes: ShapeLibrary, protocol: CropProtocol) -> None:
+    report = run(protocol, shapes, "tiny", **{**OPTIONS, "pairs": 1, "workers": 1})
+    assert "1 pair of 2 'val' shapes" in report.title and report.title.startswith(protocol.name)
+    stages = [FLOOR] * (protocol.sampling == "shared") + [SOLVED, REFINED]
+    assert [answer.stage for answer in report.answers] == stages
+    assert ("UTOPIC (quoted)" in printed(report)) == (protocol.name != "detail")
+
+
 def check_report(one: Report, protocol: CropProtocol | RangeProtocol) -> None:
     content = json.loads(one.to_json())
     assert content["protocol"]["name"] == protocol.name and content["shapes"] == 2
@@ -160,6 +177,7 @@ def check_report(one: Report, protocol: CropProtocol | RangeProtocol) -> None:
 
     text = printed(one)
     assert "2 pairs of 2 'val' shapes, tiny" in text
+    assert f"weights utopic (sha256 {content['methods']['utopic']['weights_sha256'][:12]})" in text
     assert "only 2 pairs: too few to mean much" in text
     assert ("no lower bound" in text) == (protocol is SHARED)
     assert ("(not the paper's data)" in text) == (protocol is SHARED)

@@ -252,7 +252,12 @@ def test_extreme_outcomes_are_reported_too(outcomes):
         "weights_name": "utopic", "weights_sha256": "0" * 64,
     }  # fmt: skip
     report = TrustReport(settings, outcomes)
-    assert not Page(page(report)).open
+    text = page(report)
+    assert not Page(text).open
+    assert report.title.endswith("seed 0, weights utopic (sha256 000000000000)") and report.title in text
+    # Wrong answers alone leave no curve to draw, and one right answer a single point of it.
+    words = "more than 20% wrong at every threshold"
+    assert (words in text) != ('<circle class="curve"' in text)
     assert json.loads(report.to_json())["by_kind"][0]["trials"] == len(outcomes)
     with open("/dev/null", "w") as nowhere:
         render(report, Console(file=nowhere))

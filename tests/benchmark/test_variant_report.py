@@ -60,6 +60,7 @@ def report(table: str = "uncertainty") -> VariantReport:
         "protocol": table,
         "data": "procedural",
         "test": {"pairs": PAIRS, "shapes": 20, "split": "val", "seed": 0},
+        "variants": {run.row.variant: {"weights_sha256": f"{run.row.variant:-<64}"} for run in runs},
         "budget": {"pairs": 100, "descriptor_pairs": 50, "minutes": 2.0, "pairs_per_s": 0.83},
     }
     return VariantReport(settings, runs)
@@ -143,6 +144,9 @@ def test_a_variant_without_overlap_has_no_overlap_accuracy():
 
 def test_json_and_page_hold_everything():
     some = report()
+    # Whose weights they are is said in the terminal and on the page, by the beginning of the hash.
+    for text in (printed(some), page(some)):
+        assert all(f"{run.row.variant:-<64}"[:12] in text for run in some.runs)
     content = json.loads(some.to_json())
     assert len(content["answers"]) == 5 * PAIRS
     row = content["summary"][0]

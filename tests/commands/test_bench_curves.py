@@ -98,8 +98,8 @@ def test_speed_hands_its_options_on(cli, protocol_run, monkeypatch, tmp_path):
     def run(shapes, *asked):
         calls.append(asked[:-1])
         settings = {
-            "weights": "utopic", "data": "shapes", "split": "val", "shapes": 1, "pairs": 2, "seed": 4,
-            "points": [60],
+            "weights": "utopic", "weights_sha256": "0" * 64, "data": "shapes", "split": "val", "shapes": 1,
+            "pairs": 2, "seed": 4, "points": [60],
         }  # fmt: skip
         return SpeedReport(settings, ())
 
@@ -111,6 +111,8 @@ def test_speed_hands_its_options_on(cli, protocol_run, monkeypatch, tmp_path):
         2,
         "--points",
         "60, 90",
+        "--batches",
+        "1,2,8",
         "--baselines",
         "open3d-ransac",
         "--seed",
@@ -118,7 +120,8 @@ def test_speed_hands_its_options_on(cli, protocol_run, monkeypatch, tmp_path):
     )
     result = cli("bench", "speed", *asked, "--device", "cpu", "--html", tmp_path / "r.html")
     assert result.exit_code == 0, result.output
-    assert calls == [("shapes", 2, 4, "utopic", [60, 90], ["open3d-ransac"], "cpu")]
+    assert calls == [("shapes", 2, 4, "utopic", [60, 90], [1, 2, 8], ["open3d-ransac"], "cpu")]
     assert "<svg" in (tmp_path / "r.html").read_text() and "Whole alignments" in result.stdout
-    result = cli("bench", "speed", "--points", "60,many")
-    assert result.exit_code == 2 and "60,many" in result.stderr
+    for option in ("--points", "--batches"):
+        result = cli("bench", "speed", option, "60,many")
+        assert result.exit_code == 2 and f"{option} 60,many" in result.stderr

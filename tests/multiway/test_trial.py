@@ -69,11 +69,12 @@ def test_a_right_batch_scores_well_and_a_wrong_one_does_not(made):
 def test_rows_are_kept_with_what_they_were_measured_with(made):
     _, known, outcome = made
     row = trial.score(outcome, known, 12.0)
-    content = json.loads(trial.to_json([row], AlignOptions(), 2, 7))
+    content = json.loads(trial.to_json([row], trial.measured_with(AlignOptions(), 2, 7)))
     assert content["rows"][0]["exact"] and content["rows"][0]["scan_s"] == 12.0
     assert content["rows"][0]["work_s"] == 6 * 12.0 + 15 * row.pair_s
     assert 0.0 <= row.own_s < outcome.seconds
     assert (content["workers"], content["seed"], content["options"]["weights"]) == (2, 7, "utopic")
+    assert (content["weights_name"], len(content["weights_sha256"])) == ("utopic", 64)
 
 
 def test_overlap_is_that_of_the_surfaces_and_none_between_objects(made):
@@ -164,14 +165,20 @@ def test_the_command_asks_for_numbers_and_prints_a_row_each(tmp_path, monkeypatc
         return rows + [replace(row, scans=count, drawn=True) for count in more["drawn"]]
 
     monkeypatch.setattr(trial, "run_trials", run_trials)
-    out = tmp_path / "out.json"
+    out, page = tmp_path / "out.json", tmp_path / "out.html"
     arguments = ["bench", "batch", "--scans", "10,31", "--drawn", "300", "--workers", "2", "--points", "99"]
-    result = CliRunner().invoke(app, [*arguments, "--keep", str(tmp_path), "--json", str(out)])
+    result = CliRunner().invoke(
+        app, [*arguments, "--keep", str(tmp_path), "--json", str(out), "--html", str(page)]
+    )
     assert result.exit_code == 0, result.output
     assert asked == [([10, 31], 99, 2, [300], tmp_path)]
     assert "31" in result.stdout and result.stdout.count("exact") == 3 and "28%" in result.stdout
     assert "~660 s" in result.stdout and " 391 s" in result.stdout
-    assert [entry["scans"] for entry in json.loads(out.read_text())["rows"]] == [10, 31, 300]
+    content = json.loads(out.read_text())
+    assert [entry["scans"] for entry in content["rows"]] == [10, 31, 300]
+    title = f"weights utopic (sha256 {content['weights_sha256'][:12]})"
+    assert title in result.stdout and page.read_text().count(title) == 3  # head, heading, table
+    assert page.read_text().count("<svg") == 2
     for wrong in ("x", "1", "10,,30", "10;30"):
         for option in ("--scans", "--drawn"):
             result = CliRunner().invoke(app, ["bench", "batch", option, wrong])

@@ -34,7 +34,15 @@ class Chart:
     _marks: list[str] = field(default_factory=list)
 
     def line(self, points: Sequence[tuple[float, float]], look: str) -> None:
-        """Draw through points (across, up); what is beyond the axes is put on their ends."""
+        """Draw through points (across, up); what is beyond the axes is put on their ends.
+
+        A single point, through which no line can be seen, is drawn as a small disc.
+        """
+        if len(points) == 1:
+            x, y = points[0]
+            place = f'cx="{self._x(x):.1f}" cy="{self._y(y):.1f}"'
+            self._marks.append(f'<circle class="{look}" {place} r="2.5"/>')
+            return
         places = " ".join(f"{self._x(x):.1f},{self._y(y):.1f}" for x, y in points)
         self._marks.append(f'<polyline class="{look}" points="{places}"/>')
 

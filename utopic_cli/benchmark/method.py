@@ -130,7 +130,7 @@ class Utopic:
     refines: bool = True
 
     def settings(self) -> dict[str, Any]:
-        """Return the options and the weights' hash (see `Method.settings`)."""
+        """Return the options and the weights' name and hash (see `Method.settings`)."""
         return {**asdict(self.options), **_weights(self.options), "how": "in process"}
 
     def estimate(self, trial: Trial) -> np.ndarray:
@@ -156,7 +156,7 @@ class UtopicCommand:
     refines: bool = True
 
     def settings(self) -> dict[str, Any]:
-        """Return the options and the weights' hash (see `Method.settings`)."""
+        """Return the options and the weights' name and hash (see `Method.settings`)."""
         command = ["utopic", "align", "SOURCE", "TARGET", "-o", "T.txt", *self._flags()]
         return {**asdict(self.options), **_weights(self.options), "how": " ".join(command)}
 
@@ -202,7 +202,7 @@ def _weights(options: AlignOptions) -> dict[str, Any]:
     from utopic_cli.model.weights import load_weights
 
     card = load_weights(options.weights)[1]
-    return {"weights_sha256": card["sha256"]}
+    return {"weights_name": card["name"], "weights_sha256": card["sha256"]}
 
 
 def _environment() -> dict[str, str]:

@@ -66,8 +66,11 @@ def value_plot(
         forms: how the axes' numbers are written.
         ceiling: what lies above is drawn there.
     """
-    top = max((value for points in series.values() for _, value in points), default=0.0)
-    chart = Chart(name, *axes, (most, min(round_up(top), ceiling)), forms)
+    values = [value for points in series.values() for _, value in points]
+    top = min(round_up(max(values, default=0.0)), ceiling)
+    chart = Chart(name, *axes, (most, top), forms)
+    if not values:
+        chart.word(most / 2, top / 2, "no answers")
     for look, (one, points) in zip(_looks(), series.items()):
         chart.line(points, f"series {look}")
         for place, value in points:

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
+HASH = 12
+"""Digits of the hash of weights that titles and tables show; the JSON has them all."""
+
+
 class Tabled(Protocol):
     """A report in tables."""
 
@@ -49,6 +53,22 @@ def make_table(title: str, caption: str, words: Sequence[str], numbers: Sequence
     for heading in numbers:
         table.add_column(heading, justify="right")
     return table
+
+
+def with_weights(title: str, weights: Iterable[tuple[str, str]]) -> str:
+    """Say in a title which weights were measured.
+
+    Args:
+        title: of a report.
+        weights: names with the sha256 of their files; where there are none, the title stays as it is.
+    """
+    named = ", ".join(f"{name} (sha256 {sha256[:HASH]})" for name, sha256 in weights)
+    return f"{title}, weights {named}" if named else title
+
+
+def counted(count: int, what: str) -> str:
+    """Write how many there are of what is called so in the singular."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def add_groups(table: Table, rows: Iterable[Sequence[str]]) -> None:

@@ -19,7 +19,7 @@ from utopic_cli.benchmark.metrics import (
     overlap_band,
     summarise,
 )
-from utopic_cli.benchmark.reports import make_table, number
+from utopic_cli.benchmark.reports import counted, make_table, number, with_weights
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -117,12 +117,15 @@ class Report:
 
     @property
     def title(self) -> str:
-        """Protocol and data in one line."""
+        """Protocol, data and weights in one line."""
         tried = len({attempt.pair for attempt in self.attempts})
-        return (
-            f"scans: {self.settings['directory']} - {tried} pairs x {self.settings['poses']} start poses, "
-            f"seed {self.settings['seed']}"
+        title = (
+            f"scans: {self.settings['directory']} - {counted(tried, 'pair')} x "
+            f"{counted(self.settings['poses'], 'start pose')}, seed {self.settings['seed']}"
         )
+        methods = self.settings.get("methods", {}).values()
+        networks = [(one["weights_name"], one["weights_sha256"]) for one in methods if "weights_name" in one]
+        return with_weights(title, networks)
 
     def tables(self) -> list[Table]:
         """Return the table by overlap band."""

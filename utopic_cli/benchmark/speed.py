@@ -51,6 +51,7 @@ def run(
     seed: int = 0,
     weights: str = AlignOptions().weights,
     points: Sequence[int] = POINTS,
+    batches: Sequence[int] = BATCHES,
     baselines: Sequence[str] = (),
     device: str = "auto",
     progress: Progress | None = None,
@@ -64,6 +65,7 @@ def run(
         seed: of the pairs and of all draws.
         weights: bundled name or path.
         points: most sampled points per cloud, one case each.
+        batches: pairs in one forward, one case each.
         baselines: names from ``baselines.BASELINES``.
         device: cpu, cuda or mps; auto: the CPU and, where there is one, CUDA.
         progress: called with (cases done, cases in all, what comes next).
@@ -77,6 +79,8 @@ def run(
             "pairs must be at least 1, the seed not negative, and every number of points at least "
             f"{FEWEST_NODES}"
         )
+    if not batches or min(batches) < 1:
+        raise UsageError("every batch must hold at least 1 pair")
     methods = find_baselines(baselines)
     devices = _devices(device)
     model, card = load_network(weights, devices[0])
@@ -98,6 +102,7 @@ def run(
         "pairs": pairs,
         "seed": seed,
         "points": list(points),
+        "batches": list(batches),
         "devices": devices,
         "weights": card["name"],
         "weights_sha256": card["sha256"],
@@ -108,7 +113,7 @@ def run(
     sizes = sorted(dict.fromkeys(points))
     cases: list[tuple[str, int | None, int, str]] = []
     for one in devices:
-        cases += [(FORWARD, size, batch, one) for batch in BATCHES for size in sizes]
+        cases += [(FORWARD, size, batch, one) for batch in dict.fromkeys(batches) for size in sizes]
         cases += [(ALIGN, size, 1, one) for size in sizes]
     cases += [(method.name, None, 1, "cpu") for method in methods]
     found: list[Measurement] = []

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from utopic_cli.benchmark.method import remarks
 from utopic_cli.benchmark.plots import value_plot
 from utopic_cli.benchmark.quoted import SECONDS, TIMED_ON
-from utopic_cli.benchmark.reports import make_table, number
+from utopic_cli.benchmark.reports import counted, make_table, number, with_weights
 from utopic_cli.benchmark.speed_clock import Peak, Stopwatch
 from utopic_cli.synthesis.packing import describe_data
 
@@ -101,12 +101,13 @@ class SpeedReport:
 
     @property
     def title(self) -> str:
-        """Protocol and data in one line."""
-        return (
-            f"speed: {self.settings['weights']}, {self.settings['pairs']} pairs of "
-            f"{self.settings['shapes']} '{self.settings['split']}' shapes, "
-            f"{describe_data(self.settings['data'])}, seed {self.settings['seed']}"
+        """Protocol, data and weights in one line."""
+        title = (
+            f"speed: {counted(self.settings['pairs'], 'pair')} of {self.settings['shapes']} "
+            f"'{self.settings['split']}' shapes, {describe_data(self.settings['data'])}, "
+            f"seed {self.settings['seed']}"
         )
+        return with_weights(title, [(self.settings["weights"], self.settings["weights_sha256"])])
 
     def tables(self) -> list[Table]:
         """Return the tables: the network alone, and whole alignments with the baselines."""

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 from utopic_cli.benchmark.answers import FLOOR, REFINED, SOLVED, Answer
 from utopic_cli.benchmark.method import remarks
 from utopic_cli.benchmark.quoted import DATA, METRICS, OVERLAP_ACCURACY, QUOTED
-from utopic_cli.benchmark.reports import add_groups, json_by_rows, make_table, number, share_cell
+from utopic_cli.benchmark.reports import (
+    add_groups,
+    counted,
+    json_by_rows,
+    make_table,
+    number,
+    share_cell,
+    with_weights,
+)
 from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Summary, summarise
 from utopic_cli.benchmark.uncertainty import UncertaintySummary, summarise_uncertainty
 from utopic_cli.synthesis.packing import describe_data
@@ -37,7 +45,7 @@ class Report:
 
     @property
     def title(self) -> str:
-        """Protocol and data in one line."""
+        """Protocol, data and weights in one line."""
         protocol = self.settings["protocol"]
         how = [f"{protocol[key]}" for key in ("sampling", "rotations") if key in protocol]
         name = f"{protocol['name']} ({', '.join(how)})" if how else protocol["name"]
@@ -46,10 +54,13 @@ class Report:
             data += " (not the paper's data)"
         if protocol.get("relief"):
             data += " with relief added"
-        return (
-            f"{name}: {self.settings['pairs']} pairs of {self.settings['shapes']} '{self.settings['split']}' "
-            f"shapes, {data}, seed {self.settings['seed']}"
+        title = (
+            f"{name}: {counted(self.settings['pairs'], 'pair')} of {self.settings['shapes']} "
+            f"'{self.settings['split']}' shapes, {data}, seed {self.settings['seed']}"
         )
+        methods = self.settings.get("methods", {}).items()
+        networks = [(name, one["weights_sha256"]) for name, one in methods if "weights_sha256" in one]
+        return with_weights(title, networks)
 
     def summaries(self) -> dict[tuple[str, str, str], Summary]:
         """Summarise by (group, method, stage), in the order of the table."""
@@ -194,8 +205,7 @@ def _too_few(settings: dict[str, Any]) -> str:
     """Warn of figures that say little."""
     for what in ("pairs", "shapes"):
         if settings[what] < FEWEST:
-            one = what[:-1] if settings[what] == 1 else what
-            return f"only {settings[what]} {one}: too few to mean much; "
+            return f"only {counted(settings[what], what[:-1])}: too few to mean much; "
     return ""
 
 

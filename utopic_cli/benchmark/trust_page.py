@@ -32,7 +32,6 @@ def page(report: TrustReport) -> str:
     Returns:
         One HTML page that loads nothing from elsewhere and runs no script.
     """
-    weights = f"weights {report.settings['weights_name']} ({report.settings['weights_sha256'][:12]})"
     mistakes = [
         (
             str(one.number),
@@ -48,7 +47,7 @@ def page(report: TrustReport) -> str:
     ]
     fills = {
         "title": html.escape(report.title),
-        "summary": html.escape(f"{weights}; {hindsight(report)}"),
+        "summary": html.escape(hindsight(report)),
         "targets": plain_table(
             ("", "measured [95 % interval]", "target", "met"),
             [(what, measured, target, met_in_words(met)) for what, measured, target, met in report.targets()],
@@ -102,6 +101,8 @@ def risk_curve(report: TrustReport) -> str:
     shown = curve.risk <= MOST_RISK
     for across, look in ((curve.coverage, "curve faint"), (curve.recall, "curve")):
         chart.line(list(zip(across[shown].tolist(), curve.risk[shown].tolist())), look)
+    if not shown.any():
+        chart.word(0.5, MOST_RISK / 2, f"more than {MOST_RISK:.0%} wrong at every threshold")
     right, wrong = report.summary.accepted.right, report.summary.accepted.wrong
     if right is not None and wrong is not None:
         chart.dot(right.share, wrong.share, 5.0, "wrong", f"right {share(right)}; wrong {share(wrong)}")

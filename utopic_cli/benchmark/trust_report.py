@@ -19,7 +19,7 @@ from utopic_cli.benchmark.reliability import (
     reliability_bins,
     threshold_for,
 )
-from utopic_cli.benchmark.reports import json_by_rows, make_table, number, share
+from utopic_cli.benchmark.reports import counted, json_by_rows, make_table, number, share, with_weights
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -131,10 +131,10 @@ class TrustReport:
 
     @property
     def title(self) -> str:
-        """Protocol and data in one line."""
-        return (
-            f"confidence: {len(self.outcomes)} trials, {self.settings['data']}, seed {self.settings['seed']}"
-        )
+        """Protocol, data and weights in one line."""
+        trials = counted(len(self.outcomes), "trial")
+        title = f"confidence: {trials}, {self.settings['data']}, seed {self.settings['seed']}"
+        return with_weights(title, [(self.settings["weights_name"], self.settings["weights_sha256"])])
 
     @cached_property
     def confidence(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from utopic_cli.benchmark.paired import Difference, Figure, mean_figure
 from utopic_cli.benchmark.plots import recall_plot
 from utopic_cli.benchmark.quoted import METRICS
-from utopic_cli.benchmark.reports import json_by_rows, make_table, share_cell
+from utopic_cli.benchmark.reports import HASH, json_by_rows, make_table, share_cell
 from utopic_cli.benchmark.variant_pairs import FLOOR, SOLVERS, PairResult
 from utopic_cli.benchmark.variant_summary import (
     MEASURES,
@@ -215,8 +215,8 @@ def _matches(report: VariantReport) -> Table:
         "Training, matches, overlap and recall",
         "mean ± standard error over the pairs; hit rate: overlapping points whose best match is right; "
         "overlap accuracy at 0.5 and at first sight (mutual: by narrower labels, mutual nearest neighbours); "
-        "recall: both errors are less [95 % interval]",
-        ("variant",),
+        "recall: both errors are less [95 % interval]; weights: what the sha256 of their file begins with",
+        ("variant", "weights"),
         (
             "pairs\nseen",
             "minutes",
@@ -236,6 +236,7 @@ def _matches(report: VariantReport) -> Table:
         mutual = [None if one.overlap is None else one.overlap.accuracy_mutual for one in run.results]
         table.add_row(
             run.row.label,
+            report.settings["variants"][run.row.variant]["weights_sha256"][:HASH],
             f"{run.pairs_seen:,}",
             f"{run.minutes:.1f}",
             *(

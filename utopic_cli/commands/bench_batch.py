@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from utopic_cli.commands.bench_options import JsonOut, Outputs, Points, Workers, table_console
+from utopic_cli.commands.bench_options import HtmlOut, JsonOut, Outputs, Points, Workers, table_console
 from utopic_cli.commands.console import (
     DEFAULTS,
     MEASURING,
@@ -24,6 +25,8 @@ from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from utopic_cli.multiway.trial import TrialRow
 
 
@@ -57,6 +60,7 @@ def batch_bench(
     points: Points = DEFAULTS.points,
     workers: Workers = 1,
     json_out: JsonOut = None,
+    html_out: HtmlOut = None,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Seed = DEFAULTS.seed,
@@ -71,19 +75,20 @@ def batch_bench(
     """
     counts = _counts("--scans", scans)
     further = _counts("--drawn", drawn) if drawn else []
-    outputs = Outputs(json_out, None, overwrite)
+    outputs = Outputs(json_out, html_out, overwrite)
     outputs.check()
     console = Console(quiet=quiet)
     with console.progress() as step:
         step("loading libraries")
-        from utopic_cli.multiway.trial import run_trials, to_json
+        from utopic_cli.multiway.trial import measured_with, run_trials, to_json
 
         options = AlignOptions(weights=weights, points=points, device=device, threads=1, seed=seed)
+        settings = measured_with(options, workers, seed)
         rows = run_trials(
             counts, options, drawn=further, workers=workers, seed=seed, folder=keep, progress=step
         )
-    outputs.write_texts(lambda: to_json(rows, options, workers, seed), str, console)  # no page
-    _print_table(rows)
+    outputs.write_texts(lambda: to_json(rows, settings), lambda: _page(rows, settings), console)
+    table_console().print(_table(rows, settings))
 
 
 def _counts(option: str, text: str) -> list[int]:
@@ -93,11 +98,51 @@ def _counts(option: str, text: str) -> list[int]:
     return counts
 
 
-def _print_table(rows: list[TrialRow]) -> None:
+def _title(settings: dict[str, Any]) -> str:
+    from utopic_cli.benchmark.reports import with_weights
+
+    title = f"batch: simulated scans of several objects, mixed, seed {settings['seed']}"
+    return with_weights(title, [(settings["weights_name"], settings["weights_sha256"])])
+
+
+def _page(rows: list[TrialRow], settings: dict[str, Any]) -> str:
+    """Draw pairs and time over the number of scans, with the table."""
+    from utopic_cli.benchmark.result_page import result_page
+
+    ordered = sorted(rows, key=lambda row: row.scans)
+    figures = [
+        _plot(
+            ordered,
+            "Pairs",
+            "Tried, and all there are.",
+            {"tried": lambda row: row.pairs, "all": lambda row: row.all_pairs},
+        ),
+        _plot(
+            ordered,
+            "Seconds",
+            "What one worker takes for scans and pairs, and this process for all else.",
+            {"scans and pairs": lambda row: row.work_s, "all else": lambda row: row.own_s},
+        ),
+    ]
+    return result_page(_title(settings), (), figures, [_table(rows, settings)], settings)
+
+
+def _plot(
+    rows: list[TrialRow], name: str, caption: str, values: dict[str, Callable[[TrialRow], float]]
+) -> str:
+    from utopic_cli.benchmark.chart import round_up
+    from utopic_cli.benchmark.plots import value_plot
+
+    series = {one: [(row.scans, value(row)) for row in rows] for one, value in values.items()}
+    most = round_up(max(row.scans for row in rows))
+    return value_plot(name, caption, ("scans", name.lower()), series, most, ("{:g}", "{:g}"))
+
+
+def _table(rows: list[TrialRow], settings: dict[str, Any]) -> Table:
     from utopic_cli.benchmark.reports import make_table
 
     table = make_table(
-        "Simulated scans of several objects, mixed",
+        _title(settings),
         "Times are wall time of one process. Memory: this process + the largest worker. "
         "~: estimated; answers of pairs are drawn from those of other rows, so groups say little there.",
         (),
@@ -125,4 +170,4 @@ def _print_table(rows: list[TrialRow]) -> None:
             f"{row.worst_deg:.2f}°",
             f"{row.worst_percent:.2f} %",
         )
-    table_console().print(table)
+    return table

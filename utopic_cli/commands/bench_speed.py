@@ -35,6 +35,14 @@ def speed(
             rich_help_panel=MEASURING,
         ),
     ] = "512,717,1024,2048,5000",
+    batches: Annotated[
+        str,
+        typer.Option(
+            metavar="N,..",
+            help="Pairs that the network sees at once, one case each.",
+            rich_help_panel=MEASURING,
+        ),
+    ] = "1,4",
     weights: Weights = DEFAULTS.weights,
     baselines: Baselines = "",
 ) -> None:
@@ -45,10 +53,7 @@ def speed(
     Example: [bold]utopic bench speed --points 717,1024 --json speed.json[/bold]
     """
     asked.outputs.check()
-    try:
-        sizes = [int(size) for size in names(points)]
-    except ValueError as error:
-        raise UsageError(f"--points {points}: give whole numbers with commas between them") from error
+    sizes, together = _numbers("--points", points), _numbers("--batches", batches)
     console = Console(quiet=asked.quiet)
     with console.progress() as step:
         step("loading libraries")
@@ -58,7 +63,23 @@ def speed(
         shapes = open_data(data, step)
         step("making pairs")
         report = run(
-            shapes, data, pairs, asked.seed, weights, sizes, names(baselines), asked.device, countdown(step)
+            shapes,
+            data,
+            pairs,
+            asked.seed,
+            weights,
+            sizes,
+            together,
+            names(baselines),
+            asked.device,
+            countdown(step),
         )
     asked.outputs.write(report, console)
     render(report, table_console())
+
+
+def _numbers(option: str, text: str) -> list[int]:
+    try:
+        return [int(number) for number in names(text)]
+    except ValueError as error:
+        raise UsageError(f"{option} {text}: give whole numbers with commas between them") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -192,16 +192,27 @@ def score(outcome: BatchOutcome, known: dict[str, Known], scan_s: float) -> Tria
     )
 
 
-def to_json(rows: Sequence[TrialRow], options: AlignOptions, workers: int, seed: int) -> str:
-    """Return all rows with what they were measured with."""
-    content = {
+def measured_with(options: AlignOptions, workers: int, seed: int) -> dict[str, Any]:
+    """Return what rows are measured with, JSON-ready.
+
+    Raises:
+        InputError: the weights or the device can't be used.
+    """
+    weights = weights_of(options)
+    return {
         "protocol": "batch",
         "utopic_cli": __version__,
         "options": asdict(options),
+        "weights_name": weights["name"],
+        "weights_sha256": weights["sha256"],
         "workers": workers,
         "seed": seed,
-        "rows": [{**asdict(row), "work_s": row.work_s} for row in rows],
     }
+
+
+def to_json(rows: Sequence[TrialRow], settings: Mapping[str, Any]) -> str:
+    """Return all rows with what they were measured with."""
+    content = {**settings, "rows": [{**asdict(row), "work_s": row.work_s} for row in rows]}
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
