@@ -140,27 +140,38 @@ def test_a_run_without_records_has_a_page():
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
-def test_a_browser_draws_every_curve_without_a_complaint(tmp_path):
-    records = [record(i, descriptor=5.0 / i, hit_rate=0.1 * i, waiting=0.0) for i in range(1, 9)]
-    (tmp_path / "curves.html").write_text(curves_page(records, "run", SETTINGS), encoding="utf-8")
+def drawn_by_a_browser(records, folder):
+    """What Chromium makes of the page of these records, without the script's own text."""
+    (folder / "curves.html").write_text(curves_page(records, "run", SETTINGS), encoding="utf-8")
     flags = "--headless --no-sandbox --disable-gpu --enable-logging=stderr --virtual-time-budget=2000"
     done = subprocess.run(
         [
             str(BROWSER),
             *flags.split(),
             "--dump-dom",
-            f"--user-data-dir={tmp_path / 'profile'}",
-            tmp_path / "curves.html",
+            f"--user-data-dir={folder / 'profile'}",
+            folder / "curves.html",
         ],
         capture_output=True,
         text=True,
         timeout=60,
     )
     assert "CONSOLE" not in done.stderr
-    drawn = done.stdout.split("<script", 1)[0]  # without the script's own text
+    return done.stdout.split("<script", 1)[0]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
+def test_a_browser_draws_every_curve_without_a_complaint(tmp_path):
+    records = [record(i, descriptor=5.0 / i, hit_rate=0.1 * i, waiting=0.0) for i in range(1, 9)]
+    drawn = drawn_by_a_browser(records, tmp_path)
     curves = re.findall(r'<path class="curve" [^>]*d="(M[^"]*)"', drawn)
     assert [len(re.findall("[ML]", path)) for path in curves] == [8, 8, 8]
     assert not re.search(r"NaN|undefined|Infinity", drawn)
     assert re.findall(r"<b>(.*?)</b>", drawn) == ["80.0 %", "0.625", "0.0 %"]
     assert drawn.count('class="stage"') == 3
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
+def test_a_browser_draws_single_values_as_dots(tmp_path):
+    drawn = drawn_by_a_browser([record(1, descriptor=5.0, waiting=0.0)], tmp_path)
+    assert drawn.count("<circle") == 2
