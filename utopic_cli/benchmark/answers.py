@@ -205,9 +205,7 @@ class _Desk:
                     again = matcher.look(look.prepared, look.prepared.normalise(T))
             for name, view in (("first", look.view), ("final", again)):
                 told[f"{name}_overlap"] = measure_overlap(view, self._known)
-                told[f"{name}_uncertainty"] = measure_uncertainty(
-                    look.prepared, view, self._known.source_overlap, self._known.target_overlap
-                )
+                told[f"{name}_uncertainty"] = measure_uncertainty(look.prepared, view, self._known)
         inlier_radius = self._protocol.inlier_radius(look.prepared)
         return Answer(
             **self._about,

@@ -220,13 +220,27 @@ def measure_matches(scores: np.ndarray, known: KnownNodes, inlier_radius: float)
         known: the answer.
         inlier_radius: normalised units.
     """
-    best = scores.argmax(axis=1)
-    error = np.take_along_axis(known.distance, best[:, None], axis=1)[:, 0]
+    error = _match_error(scores, known.distance)
     surest = np.argsort(-scores.max(axis=1), kind="stable")[:SUREST]
     hits = error[known.source_overlap] < HIT_REACH * known.spacing
     return MatchMeasures(
         float(hits.mean()) if len(hits) else None, float((error[surest] < inlier_radius).mean())
     )
+
+
+def hit(scores: np.ndarray, distance: np.ndarray, spacing: float) -> np.ndarray:
+    """Tell whose best match lies within 2.2 node spacings of the true place -> (N,) bool.
+
+    Args:
+        scores: (N, M) without slack.
+        distance: (N, M) from where each node belongs to each node of the other cloud.
+        spacing: node spacing.
+    """
+    return _match_error(scores, distance) < HIT_REACH * spacing
+
+
+def _match_error(scores: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    return np.take_along_axis(distance, scores.argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from utopic_cli.benchmark.reports import (
     with_weights,
 )
 from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Summary, summarise
-from utopic_cli.benchmark.uncertainty import UncertaintySummary, summarise_uncertainty
+from utopic_cli.benchmark.uncertainty import MATCHED, UncertaintySummary, summarise_uncertainty
 from utopic_cli.synthesis.packing import describe_data
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Report:
             tables.append(_paper(self))
         tables.append(_matches(self))
         if self.uncertainties():
-            tables.append(_uncertainty(self))
+            tables += [_uncertainty(self), _matches_by_place(self)]
         return tables
 
     def losses(self) -> list[str]:
@@ -277,6 +277,20 @@ def _uncertainty(report: Report) -> Table:
     for (method, look), row in report.uncertainties().items():
         values = (*row.places.values(), row.border_auc, row.plain_auc, row.failed, row.right, row.failed_auc)
         table.add_row(method, look, *(number(value, "{:.3f}") for value in values))
+    return table
+
+
+def _matches_by_place(report: Report) -> Table:
+    table = make_table(
+        "Matches by place, and whether uncertainty tells the wrong ones",
+        "hit rate of the overlapping nodes, places as above; AUC: probability that one whose best match is "
+        "wrong is more uncertain than one whose is right",
+        ("method", "look"),
+        (*(f"hit rate\n{place}" for place in MATCHED), "AUC\nwrong, right"),
+    )
+    for (method, look), row in report.uncertainties().items():
+        values = (*(number(row.hits[place], "{:.3f}") for place in MATCHED), number(row.wrong_auc, "{:.3f}"))
+        table.add_row(method, look, *values)
     return table
 
 

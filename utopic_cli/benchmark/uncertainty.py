@@ -2,7 +2,8 @@
 
 The paper's claim (Sec. 3.3.2) is that overlap is uncertain at the border of the overlap and
 where a surface shows nothing to go by. Raw variance is compared, not the min-max normalised one,
-which can't say that a whole pair is bad.
+which can't say that a whole pair is bad. Beside it stands how often the matches are right, by place: an
+uncertainty that means something is high where they are not.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from utopic_cli.benchmark.pair_metrics import KnownNodes, hit
 from utopic_cli.bridge import NetworkView
 from utopic_cli.preprocess import PreparedPair, SampledCloud
 
@@ -22,6 +24,9 @@ BORDER_REACH = 2.2
 PLACES = ("border", "inside", "outside", "plain", "rich")
 """At the border of the overlap; in it, off the border; out of it, off the border; and of the nodes
 in the overlap, off the border, the quarter with the least and that with the most relief."""
+
+MATCHED = ("border", "inside", "plain", "rich")
+"""Places with nodes that overlap, so that a match of theirs can be right."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +39,18 @@ class UncertaintyByPlace:
         border_auc: probability that a node at the border is more uncertain than one inside (half
             for ties); None without both.
         plain_auc: the same of a plain one against a rich one.
+        wrong_auc: the same, of the overlapping nodes, of one whose best match is wrong against one whose is
+            right.
+        hits: hit rate (see ``MatchMeasures``) of the overlapping nodes by place of ``MATCHED``; None where
+            there are fewer than five.
     """
 
     mean: float
     places: dict[str, float | None]
     border_auc: float | None
     plain_auc: float | None
+    wrong_auc: float | None
+    hits: dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,8 @@ class UncertaintySummary:
         places: mean over pairs of the mean by place of ``PLACES``; None where no pair has such nodes.
         border_auc: mean over pairs; see ``UncertaintyByPlace``.
         plain_auc: likewise.
+        wrong_auc: likewise.
+        hits: mean over pairs of the hit rate by place of ``MATCHED``.
         failed: mean over the pairs whose answer is wrong; None without such a pair.
         right: mean over the others.
         failed_auc: probability that a pair that fails is more uncertain than one that doesn't.
@@ -58,6 +71,8 @@ class UncertaintySummary:
     places: dict[str, float | None]
     border_auc: float | None
     plain_auc: float | None
+    wrong_auc: float | None
+    hits: dict[str, float | None]
     failed: float | None
     right: float | None
     failed_auc: float | None
@@ -71,29 +86,32 @@ def summarise_uncertainty(pairs: Sequence[UncertaintyByPlace], right: Sequence[b
         {place: _mean([pair.places[place] for pair in pairs]) for place in PLACES},
         _mean([pair.border_auc for pair in pairs]),
         _mean([pair.plain_auc for pair in pairs]),
+        _mean([pair.wrong_auc for pair in pairs]),
+        {place: _mean([pair.hits[place] for pair in pairs]) for place in MATCHED},
         _mean(means[~good].tolist()),
         _mean(means[good].tolist()),
         area_under_curve(means[~good], means[good]),
     )
 
 
-def measure_uncertainty(
-    prepared: PreparedPair, view: NetworkView, source_overlap: np.ndarray, target_overlap: np.ndarray
-) -> UncertaintyByPlace:
+def measure_uncertainty(prepared: PreparedPair, view: NetworkView, known: KnownNodes) -> UncertaintyByPlace:
     """Sort the nodes of a pair by place and compare their raw uncertainty.
 
     Args:
         prepared: the pair.
         view: what the network said of it.
-        source_overlap: (N,) bool, known.
-        target_overlap: (M,) bool, known.
+        known: the known answer at its nodes.
     """
     found: dict[str, list[np.ndarray]] = {place: [] for place in PLACES}
+    hits: dict[str, list[np.ndarray]] = {place: [] for place in MATCHED}
+    wrong: list[np.ndarray] = []
+    right: list[np.ndarray] = []
+    scores, distance = view.matching_scores, known.distance
     sides = (
-        (prepared.source, source_overlap, view.source_raw),
-        (prepared.target, target_overlap, view.target_raw),
+        (prepared.source, known.source_overlap, view.source_raw, hit(scores, distance, known.spacing)),
+        (prepared.target, known.target_overlap, view.target_raw, hit(scores.T, distance.T, known.spacing)),
     )
-    for cloud, overlap, raw in sides:
+    for cloud, overlap, raw, matched in sides:
         border = _at_border(cloud.points, overlap, BORDER_REACH * prepared.spacing)
         inside = overlap & ~border
         plain, rich = _quarters(relief(cloud), inside)
@@ -106,12 +124,18 @@ def measure_uncertainty(
         }
         for place, chosen in where.items():
             found[place].append(raw[chosen])
+        for place in MATCHED:
+            hits[place].append(matched[where[place] & overlap])
+        wrong.append(raw[overlap & ~matched])
+        right.append(raw[overlap & matched])
     values = {place: np.concatenate(parts) for place, parts in found.items()}
     return UncertaintyByPlace(
         float(np.concatenate([view.source_raw, view.target_raw]).mean()),
-        {place: float(raw.mean()) if len(raw) >= 5 else None for place, raw in values.items()},
+        {place: _mean_of(raw) for place, raw in values.items()},
         area_under_curve(values["border"], values["inside"]),
         area_under_curve(values["plain"], values["rich"]),
+        area_under_curve(np.concatenate(wrong), np.concatenate(right)),
+        {place: _mean_of(np.concatenate(parts)) for place, parts in hits.items()},
     )
 
 
@@ -134,6 +158,10 @@ def area_under_curve(
         return None
     below = np.searchsorted(low, high, side="left") + np.searchsorted(low, high, side="right")
     return float(below.mean() / (2.0 * len(low)))
+
+
+def _mean_of(values: np.ndarray) -> float | None:
+    return float(values.mean()) if len(values) >= 5 else None
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
