@@ -83,6 +83,24 @@ def test_likeness_forgives_roughness_that_agreement_does_not(gt_transformation: 
     assert met.agreement < 0.65 and 0.85 < met.likeness <= MOST_ALIKE
 
 
+def test_excess_is_low_where_scans_lie_as_close_as_their_own_points(
+    answered: tuple[Estimate, Evidence], scans: Scans, gt_transformation: np.ndarray
+) -> None:
+    problem = make_problem(*scans, gt_transformation, wrong=0.5)
+    estimate = answered[0]
+    shifted = gt_transformation.copy()
+    shifted[:3, 3] += 0.25 * VOXEL
+    right, off = (
+        evidence_of(
+            problem,
+            scans,
+            dataclasses.replace(estimate, best=dataclasses.replace(estimate.best, T_target_source=T)),
+        )
+        for T in (gt_transformation, shifted)
+    )
+    assert right.excess < 0.15 and off.excess > right.excess + 0.2
+
+
 @pytest.fixture(scope="module")
 def answered(scans: Scans, gt_transformation: np.ndarray) -> tuple[Estimate, Evidence]:
     problem = make_problem(*scans, gt_transformation, wrong=0.5)

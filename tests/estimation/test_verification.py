@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import VOXEL, lumpy_surface
-from utopic_cli.estimation.depth_map import DepthMap
+from utopic_cli.estimation.depth_map import DepthMap, find_direction
 from utopic_cli.estimation.surface import make_surface, point_spacing, thinned
 from utopic_cli.estimation.verification import measure_fit, verify
 from utopic_cli.geometry import rigid
@@ -38,6 +38,21 @@ def test_depth_map_turns_with_the_scan() -> None:
         True,
         False,
     ]
+
+
+def test_the_direction_is_the_one_that_hides_least() -> None:
+    # Louvres, tilted by 50 degrees: from above all of them is seen, along their normals half lies behind.
+    tilt = np.radians(50.0)
+    normal, along = np.array([np.sin(tilt), 0.0, np.cos(tilt)]), np.array([np.cos(tilt), 0.0, -np.sin(tilt)])
+    u, v, number = np.meshgrid(np.arange(0, 1, 0.03), np.arange(0, 3, 0.06), np.arange(6), indexing="ij")
+    points = u.reshape(-1, 1) * along + np.stack([0.7 * number, v, 0.0 * v], axis=-1).reshape(-1, 3)
+    motion = rigid.random_rotation(np.random.default_rng(4))
+    found = find_direction(points @ motion.T, np.tile(motion @ normal, (len(points), 1)))
+    assert np.linalg.norm(found) == pytest.approx(1.0)
+    assert np.degrees(np.arccos(found @ motion @ [0.0, 0.0, 1.0])) < 25.0
+    plate = points[number.ravel() == 0]
+    alone = find_direction(plate, np.tile(normal, (len(plate), 1)))
+    assert np.degrees(np.arccos(min(alone @ normal, 1.0))) < 5.0
 
 
 def test_free_space_prefers_the_true_transformation_over_a_penetrating_one() -> None:

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from utopic_cli.estimation.candidates import LEAST_SUPPORT
-from utopic_cli.estimation.meeting import MEETING, meet, self_agreement
+from utopic_cli.estimation.meeting import MEETING, meet, self_agreement, self_tightness
 from utopic_cli.estimation.observability import Twists, stiffness
 from utopic_cli.estimation.solver import Estimate
 from utopic_cli.estimation.surface import Surface
@@ -32,6 +32,7 @@ class Evidence:
         agreement: see ``Meeting``.
         likeness: see ``Meeting``.
         tightness: see ``Meeting``; less is better.
+        excess: log10 of ``tightness`` over how closely the scans lie on themselves; less is better.
         turning: see ``Meeting``; less is better.
         conflict: log10 of that of ``Meeting``, from -2.5 (none) up; less is better.
         completeness: 0 up to an overlap of .9, 1 where all of both scans meets: scans from different
@@ -60,6 +61,7 @@ class Evidence:
     agreement: float
     likeness: float
     tightness: float
+    excess: float
     turning: float
     conflict: float
     completeness: float
@@ -82,6 +84,9 @@ class Evidence:
         """Return the signals by name."""
         return asdict(self)
 
+
+EVEN = 0.003
+"""Voxels, added to both sides of ``excess``: closer than that is as close as can be."""
 
 SAME = -3.0
 """Answers a thousandth of the size apart are one and the same."""
@@ -144,6 +149,7 @@ def collect_evidence(
         agreement=meeting.agreement,
         likeness=meeting.likeness,
         tightness=meeting.tightness,
+        excess=float(np.log10((meeting.tightness + EVEN) / (self_tightness(source, target) + EVEN))),
         turning=meeting.turning,
         conflict=float(np.log10(meeting.conflict + NO_CONFLICT)),
         completeness=max(overlap - 0.9, 0.0) / 0.1,

@@ -95,16 +95,29 @@ def self_agreement(source: Surface, target: Surface) -> float:
 
 
 def _self_agreement(surface: Surface) -> float:
+    beside, cosine = _beside_itself(surface)
+    return float(((beside < CLOSE) & (cosine > AGREEING)).mean()) if len(beside) else 0.0
+
+
+def self_tightness(source: Surface, target: Surface) -> float:
+    """Mean over the scans of how closely a scan lies on itself: ``tightness`` between its own neighbours."""
+    own = []
+    for surface in (source, target):
+        beside, cosine = _beside_itself(surface)
+        agreed = beside[(beside < CLOSE) & (cosine > AGREEING)]
+        own.append(float(np.median(agreed)) if len(agreed) else CLOSE)
+    return float(np.mean(own))
+
+
+def _beside_itself(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of points from their neighbours' tangent planes, in voxels, and cosine of the normals."""
     chosen = slice(None, None, max(1, len(surface.points) // SAMPLES))
     points, normals = surface.points[chosen], surface.normals[chosen]
     distance, index = surface.tree.query(points, k=[NEXT + 1], distance_upper_bound=MEETING * surface.voxel)
     near = np.isfinite(distance[:, 0])
     index, points, normals = index[near, 0], points[near], normals[near]
-    if not len(points):
-        return 0.0
     beside = np.abs(np.einsum("nd,nd->n", surface.points[index] - points, surface.normals[index]))
-    cosine = np.einsum("nd,nd->n", normals, surface.normals[index])
-    return float(((beside < CLOSE * surface.voxel) & (cosine > AGREEING)).mean())
+    return beside / surface.voxel, np.einsum("nd,nd->n", normals, surface.normals[index])
 
 
 @dataclass(frozen=True)
