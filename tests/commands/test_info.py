@@ -47,6 +47,19 @@ def test_a_damaged_weights_file_is_called_so(cli, monkeypatch, tmp_path):
     assert "lonely.json" in weights["lonely"]["card"]
 
 
+def test_weights_of_ones_own_are_described_beside_the_bundled_ones(cli, monkeypatch, tmp_path):
+    monkeypatch.setattr(info, "OPTIONAL", {})
+    bundled = bundled_weights()["utopic"]
+    for suffix in (".safetensors", ".json"):
+        (tmp_path / f"mine{suffix}").write_bytes(bundled.with_suffix(suffix).read_bytes())
+    mine = str(tmp_path / "mine.safetensors")
+    weights = json.loads(cli("info", mine, "--json").stdout)["weights"]
+    assert list(weights) == ["utopic", mine]
+    assert weights[mine]["intact"] is True and weights[mine]["pairs_seen"] == weights["utopic"]["pairs_seen"]
+    missing = cli("info", str(tmp_path / "none.safetensors"))
+    assert missing.exit_code == 4 and "none.safetensors: no such weights file" in missing.stderr
+
+
 def test_an_optional_part_that_is_missing_or_broken_says_what_to_do(monkeypatch):
     def broken(name):
         raise OSError("libusb-1.0.so.0: cannot open shared object file")

@@ -1,9 +1,10 @@
-"""``utopic info``: versions, devices, the bundled weights, optional parts."""
+"""``utopic info``: versions, devices, weights, optional parts."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -32,18 +33,25 @@ VARIABLES = (
 
 
 def info(
+    weights: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[WEIGHTS]...", help="Weights of your own, beside the bundled ones.", show_default=False
+        ),
+    ] = None,
     json_report: Annotated[bool, typer.Option("--json", help="As JSON on stdout.")] = False,
     debug: Debug = False,
 ) -> None:
     """Print versions, devices, the bundled weights with their hash, and what optional parts are there.
 
-    Put its output into reports of bugs.
+    Put its output into reports of bugs. With --json, the cards of the weights are whole: what they were
+    trained on and how, their calibration.
 
-    Example: [bold]utopic info[/bold]
+    Example: [bold]utopic info[/bold], [bold]utopic info runs/mine/utopic.safetensors --json[/bold]
     """
     with Console().progress() as progress:
         progress("loading libraries")
-        facts = collect()
+        facts = collect(weights or ())
     if json_report:
         import json
 
@@ -57,8 +65,15 @@ def info(
             typer.echo("  none")
 
 
-def collect() -> dict[str, dict[str, Any]]:
-    """Gather what ``info`` prints, as JSON-ready data by section."""
+def collect(weights: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
+    """Gather what ``info`` prints, as JSON-ready data by section.
+
+    Args:
+        weights: files to describe beside the bundled ones.
+
+    Raises:
+        InputError: there is no such file.
+    """
     import platform
 
     import torch
@@ -76,7 +91,7 @@ def collect() -> dict[str, dict[str, Any]]:
         "versions": versions | {name: _version(name) for name in REQUIRED},
         "devices": devices,
         "environment": _environment(),
-        "weights": _weights(),
+        "weights": _weights(weights),
         "optional": {name: _optional(name) for name in OPTIONAL},
     }
 
@@ -121,15 +136,15 @@ def _optional(name: str) -> str:
     return version
 
 
-def _weights() -> dict[str, Any]:
+def _weights(more: Sequence[str]) -> dict[str, Any]:
     import hashlib
 
     from utopic_cli.errors import InputError
     from utopic_cli.model.bundled import bundled_weights
-    from utopic_cli.model.weights import read_card
+    from utopic_cli.model.weights import find_weights, read_card
 
     found: dict[str, Any] = {}
-    for name, path in bundled_weights().items():
+    for name, path in {**bundled_weights(), **{one: find_weights(one) for one in more}}.items():
         facts: dict[str, Any] = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         try:
             card = read_card(path)
