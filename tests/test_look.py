@@ -32,8 +32,8 @@ def answering(prepared: PreparedPair, score: float, rival: float | None, support
     """A look whose answer and rival have these scores, all else alike."""
 
     def candidate(value: float, T: np.ndarray) -> Candidate:
-        # Three times as plausible as it scores, all else alike: its standing is its score.
-        meeting = Meeting(1.0, 1.0, 1.0, 3.0 * value, 0.0, 0.0, 0.0, 0.0, 100)
+        # The better it scores the closer it lies, so that its standing is as far ahead as its score.
+        meeting = Meeting(1.0, 1.0, 1.0, 1.0, 0.0, 1.0 - value, 0.0, 0.0, 0.0, 100)
         return Candidate(T, value, value, 0.0, "consensus", support, meeting)
 
     turn = rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 0.0, 2.0])), np.zeros(3))

@@ -22,7 +22,7 @@ CLEAR_SCORE = 0.25
 CLEAR_OUTWARDNESS = 0.1
 """Normals that point outwards less clearly than this (a flat sheet's) may have either side."""
 
-UNCLEAR_MARGIN = (0.02, 0.3)
+UNCLEAR_MARGIN = (0.01, 0.25)
 """Answers whose standing exceeds their best rival's by so much deserve a second sampling."""
 
 HOPELESS_SUPPORT = 0.04

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 FEWEST_NODES = 50
 """The network sees at least this many points of a scan that has them."""
 
-RIVAL_LAG = 0.1
+RIVAL_LAG = 0.06
 """A distinct pose whose standing is behind the best one's by less than this is named as a rival."""
 
 COUNTERPART_REACH = 3.0

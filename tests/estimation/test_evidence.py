@@ -17,7 +17,7 @@ from utopic_cli.estimation.evidence import (
     Seen,
     collect_evidence,
 )
-from utopic_cli.estimation.meeting import MOST_ALIKE, meet
+from utopic_cli.estimation.meeting import MEETING, MOST_ALIKE, meet
 from utopic_cli.estimation.observability import find_twists
 from utopic_cli.estimation.solver import Estimate, solve
 from utopic_cli.estimation.surface import Surface, make_surface
@@ -52,12 +52,13 @@ def test_a_wrong_transformation_meets_without_agreeing(
     wrong = meet(*surfaces, gt_transformation @ turn)
     assert wrong.likeness < 0.6 * right.likeness
     assert wrong.plausibility < right.plausibility - 0.2
+    assert wrong.looseness > 2.0 * right.looseness
 
 
 def test_scans_out_of_each_others_reach_do_not_meet(surfaces: tuple[Surface, Surface]) -> None:
     far = meet(*surfaces, rigid.rigid(np.eye(3), np.array([100.0, 0.0, 0.0])))
     assert (far.source_share, far.target_share, far.agreement, far.likeness, far.voxels) == (0, 0, 0, 0, 0)
-    assert far.turning == 1.0 and far.plausibility == 0.0
+    assert far.turning == 1.0 and far.plausibility == 0.0 and far.looseness == MEETING
 
 
 def test_swapping_the_scans_swaps_the_shares_alone(
@@ -66,7 +67,7 @@ def test_swapping_the_scans_swaps_the_shares_alone(
     there = meet(*surfaces, gt_transformation)
     back = meet(surfaces[1], surfaces[0], rigid.invert(gt_transformation))
     assert back.source_share == there.target_share and back.target_share == there.source_share
-    for name in ("agreement", "likeness", "tightness", "turning", "violation", "voxels"):
+    for name in ("agreement", "likeness", "tightness", "looseness", "turning", "violation", "voxels"):
         assert getattr(back, name) == pytest.approx(getattr(there, name)), name
 
 

@@ -132,21 +132,21 @@ def test_input_that_fits_no_problem_is_refused(hard_problem: Problem) -> None:
         solve(replace(hard_problem, matching_scores=np.zeros_like(hard_problem.matching_scores)))
 
 
-def test_standing_prefers_what_agrees_where_it_meets_over_what_covers_more() -> None:
-    def candidate(score: float, likeness: float, share: float, support: float, **more: float) -> Candidate:
-        meeting = replace(Meeting(share, share, 0.8, likeness, 0.08, 0.03, 0.0, 0.0, 900), **more)
+def test_standing_prefers_what_lies_closer_over_what_covers_more() -> None:
+    def candidate(score: float, looseness: float, support: float, conflict: float = 0.0) -> Candidate:
+        meeting = Meeting(0.5, 0.5, 0.8, 0.9, 0.08, looseness, 0.03, 0.0, conflict, 900)
         return Candidate(np.eye(4), score, score, 0.0, "consensus", support, meeting)
 
-    roughly_over_everything = candidate(0.44, 0.6, 0.64, 0.065)
-    exactly_over_a_part = candidate(0.39, 0.98, 0.36, 0.12)
-    assert exactly_over_a_part.standing > roughly_over_everything.standing
-    assert candidate(0.4, 0.8, 0.5, 0.0).standing == candidate(0.4, 0.8, 0.5, 1e-9).standing
     # Half a turn off, a nearly symmetric thing covers more, but lies less close.
-    turned, right = candidate(0.5, 0.9, 0.7, 0.05, tightness=0.13), candidate(0.45, 0.9, 0.6, 0.05)
+    turned, right = candidate(0.5, 0.25, 0.05), candidate(0.4, 0.15, 0.05)
     assert right.standing > turned.standing
-    flat, shaped = candidate(0.5, 0.9, 0.7, 0.05, turning=0.0), candidate(0.5, 0.9, 0.7, 0.05, turning=0.1)
-    assert shaped.standing > flat.standing
-    assert candidate(0.5, 0.9, 0.7, 0.05, conflict=0.1).standing < roughly_over_everything.standing
+    assert candidate(0.4, 0.15, 0.05).standing > candidate(0.4, 0.15, 0.02).standing
+    flat, shaped = (replace(right.meeting, turning=value) for value in (0.0, 0.1))  # type: ignore[type-var]
+    assert replace(right, meeting=shaped).standing > replace(right, meeting=flat).standing
+    assert candidate(0.4, 0.15, 0.0).standing == candidate(0.4, 0.15, 1e-9).standing
+    assert candidate(0.4, 0.15, 0.05, conflict=0.3).standing < turned.standing
+    with pytest.raises(ValueError, match="weighed"):
+        _ = replace(right, meeting=None).standing
 
 
 def test_two_estimates_of_one_pair_are_joined(

@@ -64,24 +64,21 @@ class Candidate:
     def standing(self) -> float:
         """What candidates are ranked by in the end.
 
-        The score alone likes a wrong transformation that lays much of one scan roughly on the other
+        Not the score: it likes a wrong transformation that lays much of one scan roughly on the other
         (a nearly symmetric thing, half a turn off) better than a right one of scans that share little.
-        The right one lies closer; that speaks the more for it the more the surfaces turn where they
-        meet, since flat on flat is always close; and it hardly ever puts one scan where the other saw
-        nothing.
+        Under the right one the surfaces lie closer where they meet (which says the more the more they
+        turn there: flat on flat is always close), more of the correspondences are explained, and hardly
+        anything stands where the other scan saw nothing.
+
+        Raises:
+            ValueError: it was not weighed.
         """
-        support = np.log10(max(self.support, LEAST_SUPPORT))
         if self.meeting is None:
-            return float(0.25 * self.score + 0.125 * support)
+            raise ValueError("a candidate has no standing before it is weighed")
+        support = np.log10(max(self.support, LEAST_SUPPORT))
         shape = min(self.meeting.turning, MOST_TURNING)
         conflict = min(self.meeting.conflict, MOST_CONFLICT)
-        return float(
-            0.25 * (self.score + self.meeting.plausibility)
-            + 0.125 * support
-            - 2.25 * self.meeting.tightness
-            + 0.3 * shape
-            - 0.75 * conflict
-        )
+        return float(0.08 * support - self.meeting.looseness + 0.2 * shape - 0.7 * conflict)
 
 
 def screen(
@@ -166,9 +163,9 @@ def weigh(
 ) -> list[Candidate]:
     """Add to each candidate what its standing needs: how the surfaces meet, and support.
 
-    The weights in ``Candidate.standing`` were fitted to the candidates of 234 simulated pairs (range
-    scans of training shapes, rooms, solids) and looked at on 89 pairs of other shapes: right ones came
-    first in 214 instead of 192, and in 83 instead of 71.
+    The weights in ``Candidate.standing`` were chosen on the candidates of 667 simulated pairs (sparse
+    clouds and range scans of training shapes, rooms, solids), 496 with a right one among them: it comes
+    first in 457. With the score and ``plausibility`` in its place, it did in 411.
     """
     total = max(float(correspondences.weights.sum()), 1e-300)
     alike = self_agreement(source, target)

@@ -31,6 +31,7 @@ class Meeting:
         likeness: ``agreement`` over the share of neighbours within one scan that agree as much: near 1
             where the surfaces coincide, however rough they are; at most ``MOST_ALIKE``.
         tightness: median distance from the tangent plane of those that agree, in voxels.
+        looseness: the same of all that meet: rises where surfaces cross or only run alongside.
         turning: median angle between the normals of the points that meet, as 1 - cosine.
         violation: share of points that stand where the other scan saw free space.
         conflict: ``violation`` in proportion to the points that meet the other surface.
@@ -42,6 +43,7 @@ class Meeting:
     agreement: float
     likeness: float
     tightness: float
+    looseness: float
     turning: float
     violation: float
     conflict: float
@@ -67,24 +69,25 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: fl
         alike = self_agreement(source, target)
     forward = _one_way(source, target, transformation)
     backward = _one_way(target, source, rigid.invert(transformation))
-    met, agreed = forward.met + backward.met, forward.agreed + backward.agreed
     beside = np.concatenate([forward.beside, backward.beside])
+    agree = np.concatenate([forward.agree, backward.agree])
     turning = np.concatenate([forward.turning, backward.turning])
     violation = (forward.violation + backward.violation) / 2.0
-    share = (forward.met / forward.points + backward.met / backward.points) / 2.0
-    agreement = agreed / met if met else 0.0
+    share = (forward.share + backward.share) / 2.0
+    agreement = float(agree.mean()) if len(agree) else 0.0
     return Meeting(
-        source_share=forward.met / forward.points,
-        target_share=backward.met / backward.points,
+        source_share=forward.share,
+        target_share=backward.share,
         agreement=agreement,
         likeness=min(agreement / alike, MOST_ALIKE),
-        tightness=float(np.median(beside)) if len(beside) else CLOSE,
+        tightness=float(np.median(beside[agree])) if agree.any() else CLOSE,
+        looseness=float(np.median(beside)) if len(beside) else MEETING,
         turning=float(np.median(turning)) if len(turning) else 1.0,
         violation=violation,
         conflict=violation / max(share, 0.01),
         voxels=min(
-            round(forward.agreed / forward.points * len(source.points)),
-            round(backward.agreed / backward.points * len(target.points)),
+            round(forward.agree.sum() / forward.points * len(source.points)),
+            round(backward.agree.sum() / backward.points * len(target.points)),
         ),
     )
 
@@ -122,12 +125,26 @@ def _beside_itself(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Way:
+    """One scan's points on the other's surface; the arrays are of the points that meet it.
+
+    Attributes:
+        points: how many were looked at.
+        beside: distance from the nearest point's tangent plane, in voxels.
+        turning: 1 - cosine of the angle between the normals.
+        agree: whether the point lies in the surface.
+        violation: share of all points that stand where the other scan saw free space.
+    """
+
     points: int
-    met: int
-    agreed: int
     beside: np.ndarray
     turning: np.ndarray
+    agree: np.ndarray
     violation: float
+
+    @property
+    def share(self) -> float:
+        """Share of the points that meet the other surface."""
+        return len(self.beside) / self.points
 
 
 def _one_way(moving: Surface, fixed: Surface, T: np.ndarray) -> _Way:
@@ -140,12 +157,10 @@ def _one_way(moving: Surface, fixed: Surface, T: np.ndarray) -> _Way:
     plane = fixed.normals[index]
     beside = np.abs(np.einsum("nd,nd->n", fixed.points[index] - moved[met], plane)) / fixed.voxel
     cosine = np.einsum("nd,nd->n", turned[met], plane)
-    agreed = (beside < CLOSE) & (cosine > AGREEING)
     return _Way(
         points=len(moved),
-        met=int(met.sum()),
-        agreed=int(agreed.sum()),
-        beside=beside[agreed],
+        beside=beside,
         turning=1.0 - cosine,
+        agree=(beside < CLOSE) & (cosine > AGREEING),
         violation=float(fixed.sight.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean()),
     )
