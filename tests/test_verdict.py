@@ -27,7 +27,7 @@ GOOD = {
     "conflict": -2.5,
     "spread": SAME,
     "support": -0.6,
-    "lead": 0.5,
+    "margin": 0.5,
     "fixed": -1.0,
     "stiffness": 0.5,
 }
@@ -37,7 +37,7 @@ FIXED = Observability(np.full(6, 0.3), (), np.eye(6), np.zeros(3), 500)
 def calibration(lead: float = 10.0) -> Calibration:
     """Confidence from the lead alone: one half at 0.25."""
     one = np.ones(1)
-    return Calibration(("lead",), 0 * one, one, 0.25 * one, one, lead * one, 0.0, threshold=0.9)
+    return Calibration(("margin",), 0 * one, one, 0.25 * one, one, lead * one, 0.0, threshold=0.9)
 
 
 def verdict(signals: dict[str, float] | None = None, rivals: Any = (), seen: Any = FIXED, share: float = 0.6):  # type: ignore[no-untyped-def]
@@ -55,7 +55,7 @@ def test_a_clear_answer_is_trusted_and_says_why() -> None:
 
 
 def test_confidence_under_the_threshold_is_not_trusted() -> None:
-    found = verdict({"lead": 0.2})
+    found = verdict({"margin": 0.2})
     assert not found.trusted and found.confidence is not None and found.confidence < 0.5
     assert "together they fall short of the 90%" in found.reasons[0]
 
@@ -75,22 +75,22 @@ def test_without_a_calibration_nothing_is_trusted() -> None:
     ],
 )
 def test_each_bad_sign_is_named(signals: dict[str, float], said: str) -> None:
-    found = verdict({**signals, "lead": 0.0})
+    found = verdict({**signals, "margin": 0.0})
     assert len(found.reasons) == 1 and said in found.reasons[0]
 
 
 def test_little_overlap_is_named_with_its_scan() -> None:
-    assert "only 4% of the source finds a counterpart" in verdict({"lead": 0.0}, share=0.04).reasons[0]
+    assert "only 4% of the source finds a counterpart" in verdict({"margin": 0.0}, share=0.04).reasons[0]
 
 
 def test_free_motions_are_named_by_kind_and_axis() -> None:
     turn = FreeMotion("rotation", np.array([0.0, 0.0, 1.0]), np.zeros(3))
     slide = FreeMotion("translation", np.array([0.6, -0.8, 1e-9]))
     seen = Observability(np.zeros(6), (turn,), np.eye(6), np.zeros(3), 500)
-    (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
+    (reason,) = verdict({"margin": 0.0}, seen=seen).reasons
     assert reason == "symmetric: rotation about the axis (0, 0, 1) is not determined"
     seen = Observability(np.zeros(6), (turn, slide), np.eye(6), np.zeros(3), 500)
-    (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
+    (reason,) = verdict({"margin": 0.0}, seen=seen).reasons
     assert reason.endswith("(0, 0, 1) and sliding along (0.6, -0.8, 0) are not determined")
     assert (
         motion_in_words(FreeMotion("translation", np.array([-1e-9, 0.0, 1.0]))) == "sliding along (0, 0, 1)"
@@ -98,7 +98,7 @@ def test_free_motions_are_named_by_kind_and_axis() -> None:
 
 
 def test_where_nothing_meets_that_is_said() -> None:
-    assert "too few points lie on each other" in verdict({"lead": 0.0}, seen=None).reasons[0]
+    assert "too few points lie on each other" in verdict({"margin": 0.0}, seen=None).reasons[0]
 
 
 def test_rivals_are_counted_and_their_angle_told() -> None:
@@ -106,22 +106,22 @@ def test_rivals_are_counted_and_their_angle_told() -> None:
         rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 0.0, np.radians(angle)])), np.zeros(3))
         for angle in (90.0, 180.0)
     )
-    assert "two poses fit about equally well, 90° apart" in verdict({"lead": 0.0}, [quarter]).reasons[0]
+    assert "two poses fit about equally well, 90° apart" in verdict({"margin": 0.0}, [quarter]).reasons[0]
     assert (
         "3 poses fit about equally well, up to 180° apart"
-        in verdict({"lead": 0.0}, [quarter, half]).reasons[0]
+        in verdict({"margin": 0.0}, [quarter, half]).reasons[0]
     )
 
 
 def test_a_rival_that_is_only_shifted_is_named_so() -> None:
     along = rigid.rigid(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    (reason,) = verdict({"lead": 0.0}, [along]).reasons
+    (reason,) = verdict({"margin": 0.0}, [along]).reasons
     assert reason.startswith("two poses fit about equally well, shifted against each other")
 
 
 def test_sizes_that_differ_come_first() -> None:
     ratio = {"source": 0.7, "target": 0.02}
-    found = judge(calibration(), {**GOOD, "lead": 0.0}, np.eye(4), (), FIXED, ratio, sizes=(2.0, 24.0))
+    found = judge(calibration(), {**GOOD, "margin": 0.0}, np.eye(4), (), FIXED, ratio, sizes=(2.0, 24.0))
     assert found.reasons[0] == (
         "the scans' sizes differ by a factor of about 12 (the target is the larger, 24 against 2 file units)"
         ": are both in the same unit?"
@@ -142,7 +142,7 @@ def test_an_answer_found_another_way_than_the_calibrations_has_no_verdict() -> N
 def test_no_rotation_of_a_sphere_is_determined() -> None:
     axes = tuple(FreeMotion("rotation", axis, np.zeros(3)) for axis in np.eye(3))
     seen = Observability(np.zeros(6), axes, np.eye(6), np.zeros(3), 500)
-    (reason,) = verdict({"lead": 0.0}, seen=seen).reasons
+    (reason,) = verdict({"margin": 0.0}, seen=seen).reasons
     assert reason == "symmetric: rotation is not determined about any axis, as of a sphere"
 
 

@@ -27,26 +27,23 @@ class Evidence:
     """The signals a verdict rests on, all dimensionless; more is better unless said otherwise.
 
     Attributes:
-        score: fit both ways minus free-space violation, as the solver ranks by.
-        overlap: share of the scan with less of it that meets the other one.
-        agreement: see ``Meeting``.
+        score: fit both ways minus free-space violation.
+        overlap: log10 of the share, of the scan with less of it, that meets the other one.
         likeness: see ``Meeting``.
         tightness: see ``Meeting``; less is better.
         excess: log10 of ``tightness`` over how closely the scans lie on themselves; less is better.
-        turning: see ``Meeting``; less is better.
         conflict: log10 of that of ``Meeting``, from -2.5 (none) up; less is better.
         completeness: 0 up to an overlap of .9, 1 where all of both scans meets: scans from different
             sides share less, so it speaks for a symmetric thing seen from opposite ones; less is better.
-        margin: by how much the answer's standing (see ``Candidate``) exceeds that of its best rival; from
-            ``MOST_MARGIN`` on, more of it says no more.
-        lead: log10 of how much more plausible (see ``Meeting``) the answer is than the most plausible
-            rival, from -1.7 (not at all) up.
+        margin: log10 of by how much the answer's standing (see ``Candidate``) exceeds that of its best
+            rival; from ``MOST_MARGIN`` on, more of it says no more.
+        alone: 1 if no other candidate was found at all, else 0: then ``margin`` and ``support_lead`` are
+            the most there are, and say little. Less is better.
         support: log10 of the share of the correspondences' weight that the transformation explains.
         support_lead: log10 of that share over what the best supported rival explains.
         explained: natural logarithm of one plus the number of correspondences explained.
         fixed: log10 of the smallest eigenvalue of the normal matrix over the largest.
         stiffness: see ``observability.stiffness``.
-        extent: log10 of the number of voxels in which the surfaces agree.
         seen_overlap: mean overlap the network gives the points that meet the other scan.
         seen_contrast: ``seen_overlap`` minus the mean it gives the others.
         uncertainty: mean raw uncertainty of the points that meet the other scan; less is better.
@@ -58,21 +55,18 @@ class Evidence:
 
     score: float
     overlap: float
-    agreement: float
     likeness: float
     tightness: float
     excess: float
-    turning: float
     conflict: float
     completeness: float
     margin: float
-    lead: float
+    alone: float
     support: float
     support_lead: float
     explained: float
     fixed: float
     stiffness: float
-    extent: float
     seen_overlap: float
     seen_contrast: float
     uncertainty: float
@@ -134,7 +128,6 @@ def collect_evidence(
     alike = self_agreement(source, target)
     meeting = meet(source, target, transformation, alike)
     overlap = min(meeting.source_share, meeting.target_share)
-    lead = meeting.plausibility - max((rival.plausibility for rival in estimate.rivals), default=0.0)
     rival_support = max((rival.support for rival in estimate.rivals), default=0.0)
     reach = MEETING * source.voxel
     there = source.tree.query(rigid.apply(rigid.invert(transformation), seen.target))[0] < reach
@@ -145,22 +138,19 @@ def collect_evidence(
     support = np.log10(max(estimate.support, LEAST_SUPPORT))
     return Evidence(
         score=estimate.score,
-        overlap=overlap,
-        agreement=meeting.agreement,
+        overlap=float(np.log10(overlap + NO_OVERLAP)),
         likeness=meeting.likeness,
         tightness=meeting.tightness,
         excess=float(np.log10((meeting.tightness + EVEN) / (self_tightness(source, target) + EVEN))),
-        turning=meeting.turning,
         conflict=float(np.log10(meeting.conflict + NO_CONFLICT)),
         completeness=max(overlap - 0.9, 0.0) / 0.1,
-        margin=min(estimate.margin, MOST_MARGIN),
-        lead=float(np.log10(max(lead, 0.0) + NO_LEAD)),
+        margin=float(np.log10(min(estimate.margin, MOST_MARGIN) + NO_MARGIN)),
+        alone=float(not estimate.rivals),
         support=float(support),
         support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
         explained=float(np.log1p(len(estimate.correspondences))),
         fixed=_smallest_eigenvalue(twists),
         stiffness=stiffness(source, target, transformation, twists, meeting.likeness, alike),
-        extent=float(np.log10(max(meeting.voxels, 1))),
         seen_overlap=inside,
         seen_contrast=inside - outside,
         uncertainty=float(seen.uncertainty[met].mean() if met.any() else seen.uncertainty.mean()),
@@ -180,9 +170,10 @@ def _spread_of_residuals(median: float, high: float) -> float:
     return min(high / median, MOST_RESIDUAL) if median * MOST_RESIDUAL > high else MOST_RESIDUAL
 
 
-MOST_MARGIN = 0.3
+MOST_MARGIN = 0.2
+NO_MARGIN = 0.005
 NO_CONFLICT = 0.003
-NO_LEAD = 0.02
+NO_OVERLAP = 0.01
 
 
 def _smallest_eigenvalue(twists: Twists | None) -> float:

@@ -35,7 +35,6 @@ class Meeting:
         turning: median angle between the normals of the points that meet, as 1 - cosine.
         violation: share of points that stand where the other scan saw free space.
         conflict: ``violation`` in proportion to the points that meet the other surface.
-        voxels: number of points that agree, of the scan with fewer of them.
     """
 
     source_share: float
@@ -47,13 +46,6 @@ class Meeting:
     turning: float
     violation: float
     conflict: float
-    voxels: int
-
-    @property
-    def plausibility(self) -> float:
-        """How well the meeting goes for its size: likeness times the root of the share, minus conflict."""
-        share = (self.source_share + self.target_share) / 2.0
-        return self.likeness * float(np.sqrt(share)) - self.conflict
 
 
 def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: float | None = None) -> Meeting:
@@ -85,10 +77,6 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: fl
         turning=float(np.median(turning)) if len(turning) else 1.0,
         violation=violation,
         conflict=violation / max(share, 0.01),
-        voxels=min(
-            round(forward.agree.sum() / forward.points * len(source.points)),
-            round(backward.agree.sum() / backward.points * len(target.points)),
-        ),
     )
 
 
