@@ -107,6 +107,8 @@ class AlignOptions:
         points: most points per cloud the network sees.
         refine: refine at full resolution after the network's estimate.
         solver: ``svd`` (the paper's), ``consensus``, or ``auto`` (chooses by verification).
+        max_rotation: degrees that the source is turned by at most, from where it lies or an initial
+            transformation puts it; 180 admits any pose.
         device: auto, cpu, cuda or mps.
         threads: CPU threads; 0 leaves the library's choice.
         seed: seed of every random draw.
@@ -116,6 +118,7 @@ class AlignOptions:
     points: int = 1024
     refine: bool = True
     solver: str = "auto"
+    max_rotation: float = 180.0
     device: str = "auto"
     threads: int = 0
     seed: int = 0
@@ -128,6 +131,7 @@ class OptionValues(TypedDict, total=False):
     points: int
     refine: bool
     solver: str
+    max_rotation: float
     device: str
     threads: int
     seed: int

@@ -10,6 +10,7 @@ import numpy as np
 from utopic_cli.bridge import NetworkView
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.evidence import SAME
+from utopic_cli.estimation.prior import ANYWHERE, Prior
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import Estimate, solve
 from utopic_cli.estimation.surface import Surface
@@ -86,14 +87,14 @@ class Look:
         return float(np.clip(np.log10(max(apart, 1e-12)), SAME, 0.0))
 
 
-def look(see: See, prepared: PreparedPair, solver: str = "auto", initial: np.ndarray | None = None) -> Look:
+def look(see: See, prepared: PreparedPair, solver: str = "auto", prior: Prior = ANYWHERE) -> Look:
     """Look at a pair.
 
     Args:
         see: called with the pair.
         prepared: the pair.
         solver: see ``solve``.
-        initial: (4, 4) transformation to try first, in file units.
+        prior: what is known of the transformation beforehand, in file units.
 
     Raises:
         InputError: no transformation follows from what was seen.
@@ -112,27 +113,27 @@ def look(see: See, prepared: PreparedPair, solver: str = "auto", initial: np.nda
         spacing=prepared.spacing,
     )
     try:
-        estimate = solve(problem, solver, None if initial is None else prepared.normalise(initial))
+        if prior.initial is not None:  # scaled and shifted, but not turned
+            prior = replace(prior, initial=prepared.normalise(prior.initial))
+        estimate = solve(problem, solver, prior)
     except ValueError as error:
         raise InputError(f"no transformation can be found between these scans: {error}") from error
     return Look(prepared, view, estimate, problem.surfaces)
 
 
-def look_both_sides(
-    see: See, prepared: PreparedPair, solver: str = "auto", initial: np.ndarray | None = None
-) -> Look:
+def look_both_sides(see: See, prepared: PreparedPair, solver: str = "auto", prior: Prior = ANYWHERE) -> Look:
     """Look at a pair, and where the normals' sides are in doubt, with the source inside out as well.
 
     Nothing in a point cloud says which side of a surface is the outside. The rule that decides gives
     both scans the same side nearly always; where it may not have, both are tried, and verification
     chooses. Arguments and errors are those of ``look``.
     """
-    first = look(see, prepared, solver, initial)
+    first = look(see, prepared, solver, prior)
     if solver == "svd" or not first.sides_in_doubt:
         return first
     turned = replace(prepared, source=prepared.source.turned_inside_out())
     try:
-        other = look(see, turned, solver, initial)
+        other = look(see, turned, solver, prior)
     except InputError:  # the side first taken stands
         return first
     return replace(other, inside_out=True) if other.estimate.outranks(first.estimate) else first

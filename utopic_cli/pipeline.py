@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, fields, replace
-from numbers import Integral
+from numbers import Integral, Real
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from utopic_cli.config import SOLVERS, AlignOptions, OptionValues
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.estimation.evidence import SAME, Seen, collect_evidence
 from utopic_cli.estimation.observability import Twists, find_twists, observe
+from utopic_cli.estimation.prior import ANY_ROTATION, Prior
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.estimation.surface import point_spacing
 from utopic_cli.estimation.verification import measure_fit
@@ -55,8 +56,8 @@ def align(
         source: the scan that moves: a file, or an (N, 3) array in any unit and pose.
         target: the scan that stays: a file, or an (M, 3) array in the same unit.
         initial: (4, 4) transformation to try first.
-        **options: fields of ``AlignOptions``: weights, points, refine, solver, device,
-            threads, seed.
+        **options: fields of ``AlignOptions``: weights, points, refine, solver, max_rotation,
+            device, threads, seed.
 
     Returns:
         The answer; its arrays have one value for each point of the file or row of the array, NaN
@@ -75,7 +76,11 @@ def align(
     _check_options(settings, start)
     # NumPy's whole numbers are as good as Python's, but neither torch nor JSON takes them.
     settings = replace(
-        settings, points=int(settings.points), threads=int(settings.threads), seed=int(settings.seed)
+        settings,
+        points=int(settings.points),
+        threads=int(settings.threads),
+        seed=int(settings.seed),
+        max_rotation=float(settings.max_rotation),
     )
     given = take(source, "source", settings.seed), take(target, "target", settings.seed)
     result = register(given[0].cloud, given[1].cloud, settings, initial=start)
@@ -119,6 +124,7 @@ def _register(
     clock: Clock,
 ) -> RegistrationResult:
     """The verbs of a registration, in order."""
+    prior = Prior(initial, options.max_rotation)
     clock.start("load weights")
     model, card = load_network(options.weights, options.device)
     calibration = read_calibration(card)
@@ -127,7 +133,7 @@ def _register(
     prepared = sample_pair(frame)
     clock.start("predict and solve")
     see = Eye(model, options.seed)
-    answer = look_both_sides(see, prepared, options.solver, initial)
+    answer = look_both_sides(see, prepared, options.solver, prior)
     spread = SAME
     if options.solver == "auto" and answer.unclear:
         clock.start("sample, predict and solve anew")
@@ -135,7 +141,7 @@ def _register(
         if answer.inside_out:
             again = replace(again, source=again.source.turned_inside_out())
         try:
-            other = look(see, again, options.solver, initial)
+            other = look(see, again, options.solver, prior)
         except InputError:  # nothing follows from this sampling: as far from agreeing as can be
             spread = 0.0
         else:
@@ -235,8 +241,15 @@ def _check_options(options: AlignOptions, initial: np.ndarray | None) -> None:
             raise UsageError(f"{name} is {value!r}; give a whole number of at least {least}")
     if not isinstance(options.refine, (bool, np.bool_)):
         raise UsageError(f"refine is {options.refine!r}; give True or False")
+    if not _is_angle(options.max_rotation):
+        raise UsageError(f"max_rotation is {options.max_rotation!r}; give degrees above 0, 180 at most")
     if initial is not None and not (initial.shape == (4, 4) and rigid.is_rigid(initial, 1e-6)):
         raise InputError("the initial transformation is no (4, 4) rigid motion")
+
+
+def _is_angle(value: object) -> bool:
+    number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
+    return number and 0.0 < float(value) <= ANY_ROTATION  # type: ignore[arg-type]
 
 
 def _as_motion(initial: ArrayLike) -> np.ndarray:

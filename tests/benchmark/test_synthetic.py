@@ -22,6 +22,7 @@ from utopic_cli.benchmark.result_page import page
 from utopic_cli.benchmark.synthetic import Report, run
 from utopic_cli.bridge import NetworkView
 from utopic_cli.errors import InputError, UsageError
+from utopic_cli.estimation.prior import ANYWHERE
 from utopic_cli.geometry.rigid import apply, rigid
 from utopic_cli.preprocess import prepare
 from utopic_cli.synthesis.procedural import procedural_mesh
@@ -195,7 +196,7 @@ def test_only_shapes_held_out_are_measured_on(shapes: ShapeLibrary) -> None:
 def test_shapes_that_make_no_pair_end_the_run(shapes: ShapeLibrary) -> None:
     flat = pack([(np.zeros((3, 3)), np.array([[0, 1, 2]]))], ["flat"], ["val"], ["one"])
     with pytest.raises(InputError, match="tiny: no usable pair"):
-        synthetic.answers_to(SHARED, flat, "tiny", 0, 100, Contestants(), 0)
+        synthetic.answers_to(SHARED, flat, "tiny", 0, 100, ANYWHERE, Contestants(), 0)
 
 
 def test_numbers_that_make_no_sense(shapes: ShapeLibrary) -> None:
@@ -285,7 +286,7 @@ def test_a_tiny_run_of_each_protocol(shapes: ShapeLibrary, protocol: AnyProtocol
     for number in range(2):
         gt = protocol.pair(shapes, 3, number).gt_T_target_source
         exact = Contestants(methods=(Off(gt),))
-        answers += synthetic.answers_to(protocol, shapes, "tiny", 3, 300, exact, number)
+        answers += synthetic.answers_to(protocol, shapes, "tiny", 3, 300, ANYWHERE, exact, number)
     data = "scanobjectnn:F" if protocol.name == "scanobjectnn" else "tiny"
     settings = {**settings_of(protocol), "data": data, "pairs": 2, "methods": {}}
     kind = synthetic.CurveReport if "levels" in protocol.settings() else Report

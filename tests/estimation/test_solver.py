@@ -8,6 +8,7 @@ import pytest
 from tests.estimation.conftest import VOXEL, make_problem
 from utopic_cli.estimation.candidates import Candidate
 from utopic_cli.estimation.meeting import Meeting
+from utopic_cli.estimation.prior import Prior
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import Estimate, solve
 from utopic_cli.geometry import rigid
@@ -61,9 +62,32 @@ def test_an_initial_transformation_decides_where_the_scores_say_nothing(
     rng = np.random.default_rng(0)
     noise = replace(hard_problem, matching_scores=0.01 * rng.random(hard_problem.matching_scores.shape))
     turn = rigid.rigid(rigid.nearest_rotation(np.eye(3) + rng.normal(0, 0.03, (3, 3))), np.full(3, 0.01))
-    estimate = solve(noise, "auto", initial=gt_transformation @ turn)
+    estimate = solve(noise, "auto", Prior(gt_transformation @ turn))
     assert estimate.method == "initial"
     assert_right(estimate.T_target_source, gt_transformation)
+
+
+def test_nothing_that_is_turned_farther_than_allowed_is_an_answer_or_a_rival(
+    hard_problem: Problem, gt_transformation: np.ndarray
+) -> None:
+    angle = rigid.rotation_angle_deg(gt_transformation[:3, :3])
+    found = solve(hard_problem, "auto", Prior(max_rotation=angle + 1.0))
+    assert_right(found.T_target_source, gt_transformation)
+    short = Prior(max_rotation=angle - 20.0)
+    elsewhere = solve(hard_problem, "auto", short)
+    tried = [elsewhere.best, *elsewhere.rivals]
+    assert len(tried) > 1
+    assert short.admits(np.stack([one.T_target_source for one in tried])).all()
+    # Counted from where an initial transformation puts the source, it is near enough again.
+    turn = rigid.rigid(rigid.rotation_from_vector(np.array([0.3, 0.0, 0.0])), np.zeros(3))
+    near = Prior(turn @ gt_transformation, 25.0)
+    assert_right(solve(hard_problem, "consensus", near).T_target_source, gt_transformation)
+
+
+@pytest.mark.parametrize("solver", ["auto", "svd"])
+def test_no_answer_where_none_is_allowed(hard_problem: Problem, solver: str) -> None:
+    with pytest.raises(ValueError, match=r"0\.5 degrees at most"):
+        solve(hard_problem, solver, Prior(max_rotation=0.5))
 
 
 def test_an_assignment_without_a_rotation_leaves_the_others_to_answer(
@@ -126,8 +150,6 @@ def test_input_that_fits_no_problem_is_refused(hard_problem: Problem) -> None:
         solve(replace(hard_problem, source_overlap=np.ones(2)))
     with pytest.raises(ValueError, match="spacing"):
         solve(replace(hard_problem, spacing=0.0))
-    with pytest.raises(ValueError, match="not rigid"):
-        solve(hard_problem, initial=np.zeros((4, 4)))
     with pytest.raises(ValueError, match="no transformation"):
         solve(replace(hard_problem, matching_scores=np.zeros_like(hard_problem.matching_scores)))
 

@@ -28,6 +28,7 @@ from utopic_cli.benchmark.speed_clock import cpu_seconds_so_far
 from utopic_cli.benchmark.uncertainty import UncertaintyByPlace, measure_uncertainty
 from utopic_cli.bridge import NetworkView
 from utopic_cli.errors import InputError
+from utopic_cli.estimation.prior import ANYWHERE, Prior
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.refinement import refine
 from utopic_cli.look import Look, look_both_sides
@@ -95,7 +96,13 @@ class Answer:
 
 
 def answer_pair(
-    pair: ScanPair, number: int, protocol: AnyProtocol, contestants: Contestants, points: int, seed: int = 0
+    pair: ScanPair,
+    number: int,
+    protocol: AnyProtocol,
+    contestants: Contestants,
+    points: int,
+    seed: int = 0,
+    prior: Prior = ANYWHERE,
 ) -> list[Answer]:
     """Ask everybody for a transformation, and measure it before and after refinement.
 
@@ -106,8 +113,10 @@ def answer_pair(
         contestants: who is asked.
         points: most sampled points per cloud.
         seed: of the draws of methods, together with ``number``.
+        prior: what the robust solve is told beforehand.
     """
-    desk = _Desk(pair, number, protocol, prepare(pair.source, pair.target, points, clean=protocol.cleans))
+    prepared = prepare(pair.source, pair.target, points, clean=protocol.cleans)
+    desk = _Desk(pair, number, protocol, prepared, prior)
     answers = [] if pair.shared is None else [desk.floor(pair.shared)]
     for matcher in contestants.matchers:
         answers += desk.ask(matcher)
@@ -119,8 +128,10 @@ def answer_pair(
 class _Desk:
     """One pair and everything that is known about it."""
 
-    def __init__(self, pair: ScanPair, number: int, protocol: AnyProtocol, prepared: PreparedPair) -> None:
-        self._pair, self._protocol, self._prepared = pair, protocol, prepared
+    def __init__(
+        self, pair: ScanPair, number: int, protocol: AnyProtocol, prepared: PreparedPair, prior: Prior
+    ) -> None:
+        self._pair, self._protocol, self._prepared, self._prior = pair, protocol, prepared, prior
         self._about: dict[str, Any] = {
             "pair": number,
             "group": protocol.group(number),
@@ -148,7 +159,7 @@ class _Desk:
         seconds: dict[str, float] = {}
         try:
             with _cpu(seconds, "solve"):
-                look = look_both_sides(partial(_look, matcher, seconds), self._prepared)
+                look = look_both_sides(partial(_look, matcher, seconds), self._prepared, prior=self._prior)
             seconds["solve"] -= seconds["look"]
         except InputError as error:  # no transformation follows from the scores
             return self._lost(matcher.name, seconds, str(error))

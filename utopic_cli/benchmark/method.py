@@ -190,6 +190,7 @@ class UtopicCommand:
             *("--points", str(options.points)),
             "--refine" if options.refine else "--no-refine",
             *("--solver", options.solver),
+            *("--max-rotation", str(options.max_rotation)),
             *("--device", options.device),
             *("--threads", str(options.threads)),
             *("--seed", str(options.seed)),

@@ -24,6 +24,7 @@ from utopic_cli.benchmark.synthetic_report import SCHEMA_VERSION, Report
 from utopic_cli.benchmark.versions import versions
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import UsageError
+from utopic_cli.estimation.prior import Prior
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
 Progress = Callable[[int, int, str], None]
@@ -39,6 +40,7 @@ def run(
     baselines: Sequence[str] = (),
     workers: int = 1,
     points: int = AlignOptions().points,
+    max_rotation: float = AlignOptions().max_rotation,
     device: str = "auto",
     progress: Progress | None = None,
 ) -> Report:
@@ -54,6 +56,7 @@ def run(
         baselines: names from ``contestants.KNOWN``.
         workers: processes, each with one thread; the results do not depend on their number.
         points: most sampled points per cloud.
+        max_rotation: degrees beyond which the robust solve takes no answer; whole methods are not told.
         device: of the networks.
         progress: called with (pairs done, pairs in all, what goes on).
 
@@ -74,6 +77,7 @@ def run(
         "pairs": pairs,
         "seed": seed,
         "points": points,
+        "max_rotation": max_rotation,
         "workers": workers,
         # Loaded here once, so that what can't be used ends the run before any work.
         "methods": load().settings(),
@@ -84,7 +88,12 @@ def run(
         if progress is not None:
             progress(done, of, f"{protocol.name}, pairs of {data}")
 
-    answers = each(partial(_task, protocol, test, data, seed, points, load), pairs, workers, tell)
+    answers = each(
+        partial(_task, protocol, test, data, seed, points, Prior(max_rotation=max_rotation), load),
+        pairs,
+        workers,
+        tell,
+    )
     kind = CurveReport if "levels" in settings["protocol"] else Report
     return kind(settings, protocol.groups, tuple(answer for some in answers for answer in some))
 
@@ -95,10 +104,11 @@ def _task(
     data: str,
     seed: int,
     points: int,
+    prior: Prior,
     load: Callable[[], Contestants],
 ) -> Callable[[int], list[Answer]]:
     """What a worker does once, before it answers pairs by number."""
-    return partial(answers_to, protocol, shapes, data, seed, points, load())
+    return partial(answers_to, protocol, shapes, data, seed, points, prior, load())
 
 
 def answers_to(
@@ -107,6 +117,7 @@ def answers_to(
     data: str,
     seed: int,
     points: int,
+    prior: Prior,
     contestants: Contestants,
     number: int,
 ) -> list[Answer]:
@@ -117,4 +128,4 @@ def answers_to(
     """
     with made_of(data):
         pair = protocol.pair(shapes, seed, number)
-    return answer_pair(pair, number, protocol, contestants, points, seed)
+    return answer_pair(pair, number, protocol, contestants, points, seed, prior)

@@ -19,6 +19,7 @@ from utopic_cli.benchmark.reports import (
 )
 from utopic_cli.benchmark.synthetic_summary import OverlapSummary, Summary, summarise
 from utopic_cli.benchmark.uncertainty import MATCHED, UncertaintySummary, summarise_uncertainty
+from utopic_cli.estimation.prior import ANY_ROTATION
 from utopic_cli.synthesis.packing import describe_data
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class Report:
             f"{name}: {counted(self.settings['pairs'], 'pair')} of {self.settings['shapes']} "
             f"'{self.settings['split']}' shapes, {data}, seed {self.settings['seed']}"
         )
+        if self.settings.get("max_rotation", ANY_ROTATION) < ANY_ROTATION:
+            title += f", solved for turns of {self.settings['max_rotation']:g} degrees at most"
         methods = self.settings.get("methods", {}).items()
         networks = [(name, one["weights_sha256"]) for name, one in methods if "weights_sha256" in one]
         return with_weights(title, networks)

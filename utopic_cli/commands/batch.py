@@ -16,6 +16,7 @@ from utopic_cli.commands.console import (
     Console,
     Debug,
     Device,
+    MaxRotation,
     MostPoints,
     Overwrite,
     Quiet,
@@ -80,6 +81,7 @@ def batch(
         bool, typer.Option("--dry-run", help="Say what would be done, write nothing.")
     ] = False,
     points: MostPoints = DEFAULTS.points,
+    max_rotation: MaxRotation = DEFAULTS.max_rotation,
     weights: Weights = DEFAULTS.weights,
     workers: Annotated[
         int,
@@ -141,7 +143,14 @@ def batch(
             inputs=tuple(inputs),
             out_dir=out_dir,
             pairs=pairs,
-            options=AlignOptions(weights=weights, points=points, device=device, threads=threads, seed=seed),
+            options=AlignOptions(
+                weights=weights,
+                points=points,
+                max_rotation=max_rotation,
+                device=device,
+                threads=threads,
+                seed=seed,
+            ),
             workers=workers or min(4, _cpus()),
             cluster=cluster,
             timeout_s=timeout,

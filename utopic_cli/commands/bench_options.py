@@ -20,6 +20,7 @@ from utopic_cli.commands.console import (
     Console,
     Debug,
     Device,
+    MaxRotation,
     Overwrite,
     Quiet,
     Seed,
@@ -202,6 +203,7 @@ class Asked(Common):
     weights: list[str] | None
     baselines: str
     points: int
+    max_rotation: float
     workers: int
 
 
@@ -212,10 +214,17 @@ def _asked(
     weights: SeveralWeights = None,
     baselines: Contestants = "",
     points: Points = DEFAULTS.points,
+    max_rotation: MaxRotation = DEFAULTS.max_rotation,
     workers: Workers = 1,
 ) -> Asked:
     return Asked(
-        **vars(common), pairs=pairs, weights=weights, baselines=baselines, points=points, workers=workers
+        **vars(common),
+        pairs=pairs,
+        weights=weights,
+        baselines=baselines,
+        points=points,
+        max_rotation=max_rotation,
+        workers=workers,
     )
 
 

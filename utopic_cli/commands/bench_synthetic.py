@@ -192,6 +192,7 @@ def measure(asked: Asked, data: str, make_protocol: Callable[[], AnyProtocol]) -
             baselines=baselines,
             workers=asked.workers,
             points=asked.points,
+            max_rotation=asked.max_rotation,
             device=asked.device,
             progress=countdown(step),
         )

@@ -85,6 +85,17 @@ MostPoints = Annotated[
     int,
     typer.Option(min=50, help="Most points per scan the network sees.", rich_help_panel=SOLVING),
 ]
+MaxRotation = Annotated[
+    float,
+    typer.Option(
+        metavar="DEG",
+        min=1.0,
+        max=180.0,
+        help="The source is turned by so many degrees at most, from where it lies or an initial "
+        "transformation puts it; 180: any pose.",
+        rich_help_panel=SOLVING,
+    ),
+]
 Device = Annotated[
     Literal["auto", "cpu", "cuda", "mps"],
     typer.Option(help="Where the network runs.", rich_help_panel=RUNNING),

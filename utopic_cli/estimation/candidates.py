@@ -15,6 +15,7 @@ from utopic_cli.estimation.partners import (
     partner_evidence,
     partner_reach,
 )
+from utopic_cli.estimation.prior import Prior
 from utopic_cli.estimation.problem import Problem, explained
 from utopic_cli.estimation.refinement import Stage, refine_coarse
 from utopic_cli.estimation.surface import Surface
@@ -93,9 +94,9 @@ def screen(
 class CoarseRefinement:
     """Coarse ICP between two surfaces from any transformation, from each but once."""
 
-    def __init__(self, source: Surface, target: Surface) -> None:
-        """Remember the surfaces."""
-        self.source, self.target = source, target
+    def __init__(self, source: Surface, target: Surface, prior: Prior) -> None:
+        """Remember the surfaces, and what is known of the transformation beforehand."""
+        self.source, self.target, self.prior = source, target, prior
         self._known: dict[bytes, np.ndarray] = {}
 
     def __call__(self, transformations: np.ndarray) -> np.ndarray:
@@ -113,8 +114,11 @@ def refine_candidates(
     """Refine (if ``refine``) and verify the best of the screened hypotheses.
 
     Returns:
-        The distinct candidates, best first, and those of them whose points have partners.
+        The distinct candidates that the prior admits, best first, and those of them whose points have
+        partners.
     """
+    if not screened:
+        return [], []
     source, target = refinement.source, refinement.target
     screened = sorted(screened, key=lambda hypothesis: -hypothesis.score)
     transformations = np.stack([hypothesis.T_target_source for hypothesis in screened])
@@ -125,6 +129,10 @@ def refine_candidates(
     transformations, origins = transformations[kept], np.array([screened[i].origin for i in kept])
     if refine:
         transformations = refinement(transformations)
+        admitted = refinement.prior.admits(transformations)
+        if not admitted.any():
+            return [], []
+        transformations, origins = transformations[admitted], origins[admitted]
     candidates = _verified(transformations, origins, source, target)
     kept = distinct(np.stack([candidate.T_target_source for candidate in candidates]), centre, apart)
     candidates = [candidates[i] for i in kept]

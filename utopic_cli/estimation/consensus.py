@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from utopic_cli.estimation.prior import ANYWHERE, Prior
 from utopic_cli.estimation.procrustes import procrustes_batch, procrustes_shared
 
 MERGE_ANGLE_DEG = 10.0
@@ -39,15 +40,16 @@ def consensus_hypotheses(
     limit: int = 40,
     source_normals: np.ndarray | None = None,
     target_normals: np.ndarray | None = None,
+    prior: Prior = ANYWHERE,
 ) -> list[Hypothesis]:
     """Find distinct transformations supported by mutually consistent correspondences.
 
     Two correspondences are consistent if they keep a length: the distance of their source
     points equals that of their target points within ``tolerance`` (and, with normals, the
-    angle between their normals). Second-order consistency counts the correspondences
-    consistent with *both*, which wrong pairs rarely share by chance. Each seed with the
-    neighbours it shares most with gives one transformation; its support over all
-    correspondences is its score.
+    angle between their normals), and it is turned no farther than the prior admits.
+    Second-order consistency counts the correspondences consistent with *both*, which wrong
+    pairs rarely share by chance. Each seed with the neighbours it shares most with gives one
+    transformation; its support over all correspondences is its score.
 
     Args:
         source_points: (K, 3) float64, one row a correspondence.
@@ -58,10 +60,11 @@ def consensus_hypotheses(
         limit: most hypotheses returned.
         source_normals: (K, 3) oriented unit normals, or None.
         target_normals: (K, 3) oriented unit normals, or None.
+        prior: how far the source may be turned.
 
     Returns:
         Hypotheses, best first, distinct, at most ``limit``; empty if no three
-        correspondences are consistent. The same input gives the same output.
+        correspondences are consistent, or what follows is not admitted. The same input gives the same output.
 
     Raises:
         ValueError: fewer than three correspondences, or a tolerance that is not positive.
@@ -71,7 +74,7 @@ def consensus_hypotheses(
         raise ValueError("consensus needs at least three correspondences")
     if not tolerance > 0:
         raise ValueError(f"tolerance {tolerance} is not positive")
-    first_order = _consistency(source_points, target_points, tolerance, source_normals, target_normals)
+    first_order = _consistency(source_points, target_points, tolerance, source_normals, target_normals, prior)
     seeds = _seeds(first_order, weights)
     shared = first_order[seeds] * (first_order[seeds] @ first_order)  # (S, K)
     neighbours = min(NEIGHBOURS, count - 1)
@@ -85,6 +88,7 @@ def consensus_hypotheses(
     belief = np.concatenate([strength.max(axis=1, keepdims=True), strength], axis=1)
     transformations, spread = procrustes_batch(source_points[group], target_points[group], belief)
     transformations = transformations[spread > 1e-6]
+    transformations = transformations[prior.admits(transformations)]
     if not len(transformations):
         return []
 
@@ -140,10 +144,12 @@ def _consistency(
     tolerance: float,
     source_normals: np.ndarray | None,
     target_normals: np.ndarray | None,
+    prior: Prior,
 ) -> np.ndarray:
     """(K, K) float32: 1 where a pair keeps its length (and its angle between normals), else 0.
 
-    Pairs too short to say anything are left out. Row by row in blocks that fit into the cache.
+    So does a pair whose direction would be turned farther than the prior admits. Pairs too short to
+    say anything are left out. Row by row in blocks that fit into the cache.
     """
     points = [_centred(source_points), _centred(target_points)]
     square = [np.einsum("kd,kd->k", each, each) for each in points]
@@ -164,8 +170,22 @@ def _consistency(
             difference = normals[0][rows] @ normals[0].T
             difference -= normals[1][rows] @ normals[1].T
             consistent &= np.abs(difference, out=difference) <= NORMAL_TOLERANCE
+        if prior.bounded:
+            along = _products(points[0], points[1], rows, prior)
+            along += tolerance * target_distance  # that much of it may be the points' inaccuracy
+            consistent &= along >= prior.least_cosine * source_distance * target_distance
         result[rows] = consistent
     return result
+
+
+def _products(source: np.ndarray, target: np.ndarray, rows: slice, prior: Prior) -> np.ndarray:
+    """Inner products (R, K) of source_i - source_j, turned as known beforehand, with target_i - target_j."""
+    turned = source @ prior.rotation.T.astype(source.dtype)
+    own = np.einsum("kd,kd->k", turned, target)
+    products = own[rows, None] + own
+    products -= turned[rows] @ target.T
+    products -= target[rows] @ turned.T
+    return products
 
 
 def _centred(points: np.ndarray) -> np.ndarray:

@@ -66,11 +66,11 @@ def working_voxel(source: PointCloud, target: PointCloud, spacing: float) -> flo
     return max(spacing / VOXELS_PER_SPACING, point_spacing(source.points), point_spacing(target.points))
 
 
-def check_problem(problem: Problem, initial: np.ndarray | None) -> None:
+def check_problem(problem: Problem) -> None:
     """Make sure that a problem can be solved.
 
     Raises:
-        ValueError: arrays that do not fit together, or an initial transformation that is not rigid.
+        ValueError: arrays that do not fit together.
     """
     n, m = len(problem.source_nodes), len(problem.target_nodes)
     if min(n, m) < 3:
@@ -87,8 +87,6 @@ def check_problem(problem: Problem, initial: np.ndarray | None) -> None:
             raise ValueError(f"{name} of shape {getattr(problem, name).shape}; expected {(count,)}")
     if not problem.spacing > 0:
         raise ValueError(f"spacing {problem.spacing} is not positive")
-    if initial is not None and not rigid.is_rigid(np.asarray(initial)):
-        raise ValueError("the initial transformation is not rigid")
 
 
 def explained(

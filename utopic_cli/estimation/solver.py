@@ -13,6 +13,7 @@ from utopic_cli.estimation.correspondences import (
     linear_assignment,
     overlap_weights,
 )
+from utopic_cli.estimation.prior import ANYWHERE, Prior
 from utopic_cli.estimation.problem import Problem, check_problem, explained
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.surface import Surface
@@ -88,7 +89,7 @@ class Estimate:
         return replace(self, rivals=tuple(rivals[i - 1] for i in kept))
 
 
-def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = None) -> Estimate:
+def solve(problem: Problem, solver: str = "auto", prior: Prior = ANYWHERE) -> Estimate:
     """Find the transformation of one pair.
 
     Args:
@@ -97,39 +98,44 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
             nothing after it. ``consensus`` tries the transformations that many
             correspondences agree on. ``auto`` tries both. Except for ``svd``, every
             hypothesis is refined by coarse ICP, and verification chooses.
-        initial: (4, 4) T_target_source to try as well (with ``svd``: the better of the two).
+        prior: what is known beforehand: a transformation to try as well (with ``svd``: the better of
+            the two), and how far the source may be turned; what is turned farther is no candidate.
 
     Returns:
         The best transformation with its rivals. The same input gives the same output.
 
     Raises:
-        ValueError: an unknown solver, arrays that do not fit together, an initial
-            transformation that is not rigid, or scores from which no transformation follows.
+        ValueError: an unknown solver, arrays that do not fit together, or scores from which no
+            transformation follows that the prior admits.
     """
     if solver not in ("auto", "svd", "consensus"):
         raise ValueError(f"unknown solver {solver!r}; expected auto, svd or consensus")
-    check_problem(problem, initial)
+    check_problem(problem)
     source, target = problem.surfaces
     voxel = target.voxel
     candidates = _weighted_candidates(problem)
     hypotheses: list[Hypothesis] = []
-    if initial is not None:
-        hypotheses.append(Hypothesis(np.asarray(initial, np.float64), np.inf, "initial"))
+    if prior.initial is not None:
+        hypotheses.append(Hypothesis(np.asarray(prior.initial, np.float64), np.inf, "initial"))
     if solver != "consensus":
         hypotheses += _assignment_hypothesis(problem)
     if solver != "svd":
-        hypotheses += _consensus(problem, candidates, source, target, voxel)
+        hypotheses += _consensus(problem, candidates, source, target, voxel, prior)
+    hypotheses = _admitted(hypotheses, prior)
     if not hypotheses:
-        raise ValueError("no transformation follows from the matching scores")
+        raise ValueError(_nothing(prior))
     refine = solver != "svd"
     tried = min(FIRST, len(hypotheses))
-    screened = screen(hypotheses[:tried], source, target, refine=refine)
-    refinement = CoarseRefinement(source, target)
+    screened = _admitted(screen(hypotheses[:tried], source, target, refine=refine), prior)
+    refinement = CoarseRefinement(source, target, prior)
     chosen, partners = refine_candidates(problem, screened, refinement, refine=refine)
-    if not partners and chosen[0].score < BEYOND_DOUBT and tried < len(hypotheses):
-        screened += screen(hypotheses[tried:], source, target, refine=refine)
+    unsure = not partners and (not chosen or chosen[0].score < BEYOND_DOUBT)
+    if unsure and tried < len(hypotheses):
+        screened += _admitted(screen(hypotheses[tried:], source, target, refine=refine), prior)
         tried = len(hypotheses)
         chosen, partners = refine_candidates(problem, screened, refinement, refine=refine)
+    if not chosen:  # all were drawn beyond what is admitted
+        raise ValueError(_nothing(prior))
     correspondences = candidates
     if solver == "svd" and chosen[0].origin == "assignment":
         correspondences = _assignment(problem)
@@ -148,6 +154,18 @@ def solve(problem: Problem, solver: str = "auto", initial: np.ndarray | None = N
         method=best.origin if solver == "auto" else solver,
         shared_points=bool(partners),
     )
+
+
+def _admitted(hypotheses: list[Hypothesis], prior: Prior) -> list[Hypothesis]:
+    if not hypotheses:
+        return []
+    admitted = prior.admits(np.stack([hypothesis.T_target_source for hypothesis in hypotheses]))
+    return [hypothesis for hypothesis, kept in zip(hypotheses, admitted, strict=True) if kept]
+
+
+def _nothing(prior: Prior) -> str:
+    bound = f" that turns the source by {prior.max_rotation:g} degrees at most" if prior.bounded else ""
+    return f"no transformation follows from the matching scores{bound}"
 
 
 def _assignment(problem: Problem) -> Correspondences:
@@ -186,7 +204,12 @@ def _weighted_candidates(problem: Problem) -> Correspondences:
 
 
 def _consensus(
-    problem: Problem, candidates: Correspondences, source: Surface, target: Surface, voxel: float
+    problem: Problem,
+    candidates: Correspondences,
+    source: Surface,
+    target: Surface,
+    voxel: float,
+    prior: Prior,
 ) -> list[Hypothesis]:
     if len(candidates) < 3:
         return []
@@ -200,4 +223,5 @@ def _consensus(
         PROPOSED,
         source.normals[source.tree.query(source_nodes)[1]],
         target.normals[target.tree.query(target_nodes)[1]],
+        prior,
     )
