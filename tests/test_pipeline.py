@@ -271,6 +271,26 @@ def test_arrays_that_cannot_be_used_are_explained(pair, points, message):
         align(points, pair.target.points)
 
 
+def test_what_turns_the_source_farther_than_allowed_is_no_answer(pair, result):
+    angle = rigid.rotation_angle_deg(pair.gt_T_target_source[:3, :3])
+    enough = dataclasses.replace(OPTIONS, max_rotation=angle + 5.0)
+    found = register(pair.source, pair.target, enough)
+    np.testing.assert_allclose(found.T_target_source, result.T_target_source, atol=1e-3 * pair.extent)
+    assert found.options["max_rotation"] == angle + 5.0
+    other = register(pair.source, pair.target, dataclasses.replace(OPTIONS, max_rotation=angle - 15.0))
+    # The refinement at full resolution may go a little beyond.
+    assert rigid.rotation_angle_deg(other.T_target_source[:3, :3]) < angle - 10.0
+    assert not other.trusted
+    with pytest.raises(InputError, match=r"that turns the source by 0\.5 degrees at most"):
+        register(pair.source, pair.target, dataclasses.replace(OPTIONS, max_rotation=0.5))
+
+
+def test_the_bound_counts_from_the_initial_transformation(pair):
+    near = dataclasses.replace(OPTIONS, max_rotation=10.0)
+    found = register(pair.source, pair.target, near, initial=pair.gt_T_target_source)
+    assert rotation_error(found.T_target_source, pair.gt_T_target_source) < 0.5
+
+
 def test_unknown_options_are_explained(pair):
     with pytest.raises(UsageError, match=r"unknown option voxel; known options: weights, points.*initial"):
         align(pair.source.points, pair.target.points, voxel=3)
@@ -280,6 +300,9 @@ def test_unknown_options_are_explained(pair):
         align(pair.source.points, pair.target.points, refine="no")
     with pytest.raises(UsageError, match="points is True; give a whole number"):
         align(pair.source.points, pair.target.points, points=True)
+    for degrees in (0, 181.0, np.nan, True, "45"):
+        with pytest.raises(UsageError, match=r"max_rotation is .*; give degrees above 0, 180 at most"):
+            align(pair.source.points, pair.target.points, max_rotation=degrees)
     with pytest.raises(InputError, match="initial transformation is a str; give a"):
         align(pair.source.points, pair.target.points, initial="T.txt")
     with pytest.raises(InputError, match="no bundled weights of that name"):

@@ -40,14 +40,16 @@ def test_the_command_line_gets_the_moved_file_and_every_option(
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(subprocess, "run", align)
-    options = AlignOptions(points=700, refine=False, solver="svd", device="cpu", threads=1, seed=9)
+    options = AlignOptions(
+        points=700, refine=False, solver="svd", max_rotation=30.0, device="cpu", threads=1, seed=9
+    )
     np.testing.assert_allclose(UtopicCommand(options).estimate(trial), answer, atol=1e-12)
     (command,) = calls
     assert command[:4] == [sys.executable, "-m", "utopic_cli", "align"]
     flags = " ".join(command[8:])
     assert flags == (
-        "--weights utopic --points 700 --no-refine --solver svd --device cpu --threads 1 --seed 9 "
-        "--exit-zero -q"
+        "--weights utopic --points 700 --no-refine --solver svd --max-rotation 30.0 --device cpu "
+        "--threads 1 --seed 9 --exit-zero -q"
     )
     assert not Path(command[4]).exists()  # the temporary folder is gone
 

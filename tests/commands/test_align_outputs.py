@@ -230,14 +230,23 @@ def test_quiet_says_nothing_and_verbose_says_more(cli, fake, scans, tmp_path):
     assert len(cli("align", *scans, "-v").stderr.splitlines()) > len(normal.splitlines())
 
 
+def test_where_several_poses_fit_the_way_to_say_what_is_known_is_named(cli, fake, scans):
+    fake.changes = {"ambiguous_with": (np.diag([-1.0, -1.0, 1.0, 1.0]),), "trusted": False}
+    assert "--max-rotation" in cli("align", *scans).stderr
+    assert "--max-rotation" not in cli("align", *scans, "--max-rotation", 90).stderr
+    fake.changes = {"ambiguous_with": (), "trusted": False}
+    assert "--max-rotation" not in cli("align", *scans).stderr
+
+
 def test_options_reach_the_pipeline(cli, fake, scans, tmp_path):
     np.savetxt(tmp_path / "init.txt", QUARTER_TURN)
     result = cli(
         "align", *scans, "--points", 300, "--no-refine", "--solver", "svd", "--device", "cpu",
         "--threads", 1, "--seed", 7, "--weights", "other", "--init", tmp_path / "init.txt",
+        "--max-rotation", 45,
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
-    assert fake.calls[0]["options"] == config.AlignOptions("other", 300, False, "svd", "cpu", 1, 7)
+    assert fake.calls[0]["options"] == config.AlignOptions("other", 300, False, "svd", 45.0, "cpu", 1, 7)
     np.testing.assert_array_equal(fake.calls[0]["initial"], QUARTER_TURN)
 
 

@@ -40,6 +40,7 @@ def test_a_folder_becomes_one_group(cli, stubbed, tmp_path):
     write_scans(tmp_path / "scans", ["a.ply", "b.ply", "c[1].ply"])
     out = tmp_path / "out"
     options = ["--merge", "--html", "--workers", 2, "--seed", 3, "--points", 80, "--timeout", 50]
+    options += ["--max-rotation", 60]
     result = cli("batch", tmp_path / "scans", "--out-dir", out, *options)
     assert result.exit_code == 0, result.output
     assert result.stdout == ""
@@ -61,7 +62,7 @@ def test_a_folder_becomes_one_group(cli, stubbed, tmp_path):
     }
     (asked,) = stubbed
     assert (asked.workers, asked.timeout_s, asked.options.seed, asked.options.points) == (2, 50.0, 3, 80)
-    assert asked.options.threads == 1
+    assert (asked.options.threads, asked.options.max_rotation) == (1, 60.0)
 
 
 def test_parts_and_nothing_have_exit_codes_of_their_own(cli, stubbed, tmp_path):

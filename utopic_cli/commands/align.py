@@ -259,11 +259,11 @@ def run(request: AlignRequest, console: Console) -> AlignOutcome:
             timings_s=timings_s,
         )
     outcome = AlignOutcome(source, target, result, report)
-    _say_summary(outcome, request.plan, console)
+    _say_summary(outcome, request, console)
     return outcome
 
 
-def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> None:
+def _say_summary(outcome: AlignOutcome, request: AlignRequest, console: Console) -> None:
     """Say the verdict, what it rests on, the motion, and the files written."""
     from utopic_cli.result_display import headline, residual_in_words, rounded
 
@@ -284,9 +284,11 @@ def _say_summary(outcome: AlignOutcome, plan: OutputPlan, console: Console) -> N
     shift = rounded(math.hypot(*motion["translation"]), report["target"]["extent"]["diagonal"])
     angle = f"{motion['angle_deg']:.3f} degrees about the source's centroid"
     console.fact("motion", f"{angle}, which moves by {shift:.6g} file units")
+    if result.ambiguous_with and not result.trusted and request.options.max_rotation == DEFAULTS.max_rotation:
+        console.fact("hint", "who knows about how far the source is turned can say so: --max-rotation DEG")
     if console.verbose:
         for step, seconds in report["timings_s"].items():
             console.fact("time", f"{step} {seconds:.2f} s")
         if result.weights_name:
             console.fact("weights", f"{result.weights_name} {result.weights_sha256[:12]}")
-    console.files(plan.paths)
+    console.files(request.plan.paths)
