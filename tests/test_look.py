@@ -33,7 +33,7 @@ def answering(prepared: PreparedPair, score: float, rival: float | None, support
 
     def candidate(value: float, T: np.ndarray) -> Candidate:
         # The better it scores the closer it lies, so that its standing is as far ahead as its score.
-        meeting = Meeting(1.0, 1.0, 1.0, 1.0, 0.0, 1.0 - value, 0.0, 0.0, 0.0)
+        meeting = Meeting(1.0, 1.0, 1.0, 1.0, 0.0, 1.0 - value, 0.0, 0.0, 0.0, 0.0)
         return Candidate(T, value, value, 0.0, "consensus", support, meeting)
 
     turn = rigid.rigid(rigid.rotation_from_vector(np.array([0.0, 0.0, 2.0])), np.zeros(3))

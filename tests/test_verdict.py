@@ -25,6 +25,7 @@ from utopic_cli.verdict import (
 GOOD = {
     "likeness": 1.0,
     "conflict": -2.5,
+    "contradiction": -2.5,
     "spread": SAME,
     "support": -0.6,
     "margin": 0.5,
@@ -161,7 +162,8 @@ def test_an_answer_that_another_sampling_does_not_give_again_is_never_trusted() 
 
 
 def test_scans_that_contradict_each_other_are_never_trusted_however_likely_the_answer() -> None:
-    found = verdict({"conflict": -0.7})
+    assert verdict({"conflict": -0.7}).trusted  # in one way alone: where from is a guess
+    found = verdict({"conflict": -0.7, "contradiction": -1.2})
     assert not found.trusted and found.confidence == verdict().confidence
     assert found.reasons == ("parts of one scan stand where the other saw empty space",)
 

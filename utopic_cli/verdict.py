@@ -34,10 +34,11 @@ DIFFERENT_SURFACES = 0.6
 CONFLICT = -1.5
 """Log10 of how much of the scans may stand in the other's empty space, for what of them meets."""
 
-MOST_CONFLICT = -1.0
-"""With more of it an answer is not trusted, whatever else speaks for it: 6 of the calibration's 378
-right answers have as much, and nothing else tells a body from its mirror image where most of it is
-symmetric."""
+MOST_CONTRADICTION = -1.3
+"""With a larger one (log10: a twentieth) an answer is not trusted, whatever else speaks for it: nothing
+else tells a body from its mirror image where most of it is symmetric. Both ways must see it, since the
+place a scan was taken from is a guess: where that is wrong, one way sees much conflict and the other
+hardly any."""
 
 LIMP = 0.0
 """A stiffness of no more: displaced by what a right answer may be off by, the source fits as well."""
@@ -98,7 +99,7 @@ def ruled_out(signals: dict[str, float]) -> bool:
     same scans.
     """
     undetermined = signals["fixed"] < np.log10(FREE) or signals["stiffness"] <= LIMP
-    return bool(undetermined or signals["conflict"] > MOST_CONFLICT or signals["spread"] > APART)
+    return bool(undetermined or signals["contradiction"] > MOST_CONTRADICTION or signals["spread"] > APART)
 
 
 def judge(

@@ -66,8 +66,23 @@ def test_swapping_the_scans_swaps_the_shares_alone(
     there = meet(*surfaces, gt_transformation)
     back = meet(surfaces[1], surfaces[0], rigid.invert(gt_transformation))
     assert back.source_share == there.target_share and back.target_share == there.source_share
-    for name in ("agreement", "likeness", "tightness", "looseness", "turning", "violation"):
+    names = ("agreement", "likeness", "tightness", "looseness", "turning", "violation", "contradiction")
+    for name in names:
         assert getattr(back, name) == pytest.approx(getattr(there, name)), name
+
+
+def test_where_one_scan_was_taken_from_the_other_side_there_is_conflict_but_no_contradiction(
+    surfaces: tuple[Surface, Surface], gt_transformation: np.ndarray
+) -> None:
+    """Normals inside out put the scanner behind the surface: a wrong guess, and seen in one way only."""
+    source, target = surfaces
+    inside_out = dataclasses.replace(source, normals=-source.normals)
+    guessed = meet(inside_out, target, gt_transformation)
+    assert guessed.conflict > 0.1 and guessed.contradiction < 0.01
+    turn = rigid.rigid(rigid.rotation_from_vector(np.array([1.0, 0.0, 0.0])), np.zeros(3))
+    wrong = meet(source, target, gt_transformation @ turn)
+    assert wrong.contradiction > 0.08
+    assert wrong.contradiction <= wrong.conflict
 
 
 def test_likeness_forgives_roughness_that_agreement_does_not(gt_transformation: np.ndarray) -> None:

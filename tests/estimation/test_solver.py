@@ -156,7 +156,7 @@ def test_input_that_fits_no_problem_is_refused(hard_problem: Problem) -> None:
 
 def test_standing_prefers_what_lies_closer_over_what_covers_more() -> None:
     def candidate(score: float, looseness: float, support: float, conflict: float = 0.0) -> Candidate:
-        meeting = Meeting(0.5, 0.5, 0.8, 0.9, 0.08, looseness, 0.03, 0.0, conflict)
+        meeting = Meeting(0.5, 0.5, 0.8, 0.9, 0.08, looseness, 0.03, 0.0, conflict, 0.0)
         return Candidate(np.eye(4), score, score, 0.0, "consensus", support, meeting)
 
     # Half a turn off, a nearly symmetric thing covers more, but lies less close.

@@ -33,6 +33,7 @@ class Evidence:
         tightness: see ``Meeting``; less is better.
         excess: log10 of ``tightness`` over how closely the scans lie on themselves; less is better.
         conflict: log10 of that of ``Meeting``, from -2.5 (none) up; less is better.
+        contradiction: log10 of that of ``Meeting``, likewise; less is better.
         completeness: 0 up to an overlap of .9, 1 where all of both scans meets: scans from different
             sides share less, so it speaks for a symmetric thing seen from opposite ones; less is better.
         margin: log10 of by how much the answer's standing (see ``Candidate``) exceeds that of its best
@@ -59,6 +60,7 @@ class Evidence:
     tightness: float
     excess: float
     conflict: float
+    contradiction: float
     completeness: float
     margin: float
     alone: float
@@ -143,6 +145,7 @@ def collect_evidence(
         tightness=meeting.tightness,
         excess=float(np.log10((meeting.tightness + EVEN) / (self_tightness(source, target) + EVEN))),
         conflict=float(np.log10(meeting.conflict + NO_CONFLICT)),
+        contradiction=float(np.log10(meeting.contradiction + NO_CONFLICT)),
         completeness=max(overlap - 0.9, 0.0) / 0.1,
         margin=float(np.log10(min(estimate.margin, MOST_MARGIN) + NO_MARGIN)),
         alone=float(not estimate.rivals),

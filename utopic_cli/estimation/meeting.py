@@ -35,6 +35,8 @@ class Meeting:
         turning: median angle between the normals of the points that meet, as 1 - cosine.
         violation: share of points that stand where the other scan saw free space.
         conflict: ``violation`` in proportion to the points that meet the other surface.
+        contradiction: likewise, of the way in which less of it is: where a scan was taken from is a guess,
+            and a wrong one sees violations in one way only.
     """
 
     source_share: float
@@ -46,6 +48,7 @@ class Meeting:
     turning: float
     violation: float
     conflict: float
+    contradiction: float
 
 
 def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: float | None = None) -> Meeting:
@@ -65,7 +68,7 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: fl
     agree = np.concatenate([forward.agree, backward.agree])
     turning = np.concatenate([forward.turning, backward.turning])
     violation = (forward.violation + backward.violation) / 2.0
-    share = (forward.share + backward.share) / 2.0
+    share = max((forward.share + backward.share) / 2.0, 0.01)
     agreement = float(agree.mean()) if len(agree) else 0.0
     return Meeting(
         source_share=forward.share,
@@ -76,7 +79,8 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: fl
         looseness=float(np.median(beside)) if len(beside) else MEETING,
         turning=float(np.median(turning)) if len(turning) else 1.0,
         violation=violation,
-        conflict=violation / max(share, 0.01),
+        conflict=violation / share,
+        contradiction=min(forward.violation, backward.violation) / share,
     )
 
 
