@@ -164,8 +164,12 @@ def _admitted(hypotheses: list[Hypothesis], prior: Prior) -> list[Hypothesis]:
 
 
 def _nothing(prior: Prior) -> str:
-    bound = f" that turns the source by {prior.max_rotation:g} degrees at most" if prior.bounded else ""
-    return f"no transformation follows from the matching scores{bound}"
+    if not prior.bounded:
+        return "no transformation follows from the matching scores"
+    return (
+        f"nothing that turns the source by {prior.max_rotation:g} degrees at most follows from the matching "
+        "scores; allow more"
+    )
 
 
 def _assignment(problem: Problem) -> Correspondences:
