@@ -148,8 +148,8 @@ def _consistency(
 ) -> np.ndarray:
     """(K, K) float32: 1 where a pair keeps its length (and its angle between normals), else 0.
 
-    So does a pair whose direction would be turned farther than the prior admits. Pairs too short to
-    say anything are left out. Row by row in blocks that fit into the cache.
+    It is 0 as well where the pair's direction would be turned farther than the prior admits, and of pairs
+    too short to say anything. Row by row in blocks that fit into the cache.
     """
     points = [_centred(source_points), _centred(target_points)]
     square = [np.einsum("kd,kd->k", each, each) for each in points]
