@@ -45,6 +45,7 @@ SMALLER = {
     r"^utopic bench (?!scans).*": r"\g<0> --points 100",
     r"^utopic bench scans DIR --poses 3": r"utopic bench scans scans --poses 1",
     r"--pairs \d+": "--pairs 2",
+    r"^utopic teach .*": r"\g<0> --pairs 40 --workers 2",
     r"--train-pairs \d+": "--train-pairs 4",
 }
 """By regular expressions, what stands for a part of a command; all that match are applied, in this order."""
@@ -55,7 +56,7 @@ EXIT_CODES = {
 }
 """By how a command begins, the exit codes that the page speaks of; of all others 0."""
 
-SLOW = ("utopic bench", "utopic calibrate", "torchrun")
+SLOW = ("utopic bench", "utopic calibrate", "utopic teach", "torchrun")
 
 NEEDED = {"open3d": "open3d", "kiss-matcher": "kiss_matcher", "small-gicp": "small_gicp"}
 """By how their names begin, the modules that baselines need; without them a command is skipped."""

@@ -61,7 +61,7 @@ def blind(prepared: PreparedPair) -> NetworkView:
     [
         (0.35, 0.2, True),
         (None, 0.2, False),  # alone
-        (0.05, 0.2, False),  # far ahead
+        (-0.1, 0.2, False),  # far ahead
         (0.495, 0.2, False),  # two poses fit alike: another sampling can't tell them apart
         (0.35, 0.01, False),  # explains nothing
     ],

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 import torch
 
+from utopic_cli.errors import InputError
+from utopic_cli.estimation.close_up import POINT_FEATURES, WHOLE_FEATURES, CloseUp
 from utopic_cli.geometry.nearest import search_threads
 from utopic_cli.model.cloud_input import CloudInput
+from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.model.utopic import EncodedCloud, Prediction, Utopic
 from utopic_cli.model.weights import choose_device, load_weights
 from utopic_cli.preprocess import PreparedPair, SampledCloud
+
+Verify = Callable[[Sequence[CloseUp]], np.ndarray]
+"""Says how plausible each pose is: log-odds (C,) float64."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,7 @@ class NetworkView:
         source_overlap: (N,), target_overlap: (M,) probabilities.
         source_uncertainty: (N,), target_uncertainty: (M,) min-max normalised over the pair.
         source_raw: (N,), target_raw: (M,) un-normalised.
+        verify: chooses among poses that follow from it; None where nothing has learned to.
     """
 
     matching_scores: np.ndarray
@@ -36,6 +43,7 @@ class NetworkView:
     target_uncertainty: np.ndarray
     source_raw: np.ndarray
     target_raw: np.ndarray
+    verify: Verify | None = None
 
 
 @lru_cache(maxsize=2)
@@ -46,6 +54,12 @@ def load_network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
         InputError: the weights or the device can't be used.
     """
     model, card = load_weights(weights)
+    read = {"point_features": POINT_FEATURES, "whole_features": WHOLE_FEATURES}
+    if model.verifier is not None and not read.items() <= model.verifier.sizes.items():
+        raise InputError(
+            f"{card['name']}: the verifier reads other features than this version shows it; teach another "
+            "with utopic teach"
+        )
     return model.to(choose_device(device)), card
 
 
@@ -86,7 +100,7 @@ class Eye:
                 else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
                 encoded=(encoded_source, encoded_target),
             )
-        return _as_view(prediction, self.model.config.overlap)
+        return _as_view(prediction, self.model)
 
     def _encode(self, cloud: SampledCloud, spacing: float) -> tuple[CloudInput, EncodedCloud]:
         for known, given, encoded in self._seen:
@@ -113,9 +127,18 @@ def predict(
     return Eye(model, seed)(prepared, hypothesis)
 
 
-def _as_view(prediction: Prediction, overlap: bool) -> NetworkView:
+def verify(verifier: PoseVerifier, shown: Sequence[CloseUp]) -> np.ndarray:
+    """Ask how plausible poses are, on the device the verifier is on -> (C,) float64 log-odds."""
+    device = next(verifier.parameters()).device
+    with torch.inference_mode():
+        points = torch.from_numpy(np.stack([one.points for one in shown])).to(device)
+        whole = torch.from_numpy(np.stack([one.whole for one in shown])).to(device)
+        return verifier(points, whole).cpu().numpy().astype(np.float64)
+
+
+def _as_view(prediction: Prediction, model: Utopic) -> NetworkView:
     source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
-    if not overlap:  # the variant without O weighs all correspondences alike
+    if not model.config.overlap:  # the variant without O weighs all correspondences alike
         source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
     return NetworkView(
         _array(prediction.matching_scores[:, :-1, :-1]),
@@ -125,6 +148,7 @@ def _as_view(prediction: Prediction, overlap: bool) -> NetworkView:
         _array(prediction.target_uncertainty),
         _array(prediction.source_distribution.raw_uncertainty),
         _array(prediction.target_distribution.raw_uncertainty),
+        None if model.verifier is None else partial(verify, model.verifier),
     )
 
 

@@ -28,6 +28,7 @@ from utopic_cli.commands.calibrate import calibrate
 from utopic_cli.commands.console import PlainUsage, debug_wanted
 from utopic_cli.commands.demo import demo
 from utopic_cli.commands.info import info
+from utopic_cli.commands.teach import teach
 from utopic_cli.commands.train import train
 from utopic_cli.commands.transformation import transformation
 from utopic_cli.errors import UtopicError
@@ -136,6 +137,7 @@ app.command(rich_help_panel=_ALIGN)(transformation)
 app.command(rich_help_panel=_FIRST)(demo)
 app.command(rich_help_panel=_FIRST)(info)
 app.command(rich_help_panel=_OWN)(train)
+app.command(rich_help_panel=_OWN)(teach)
 app.command(rich_help_panel=_OWN)(calibrate)
 bench.command()(confidence)
 bench.command("batch")(batch_bench)

@@ -23,8 +23,11 @@ CLEAR_SCORE = 0.25
 CLEAR_OUTWARDNESS = 0.1
 """Normals that point outwards less clearly than this (a flat sheet's) may have either side."""
 
-UNCLEAR_MARGIN = (0.01, 0.25)
+UNCLEAR_MARGIN = (0.01, 0.5)
 """Answers whose standing exceeds their best rival's by so much deserve a second sampling."""
+
+WEAK_MARGIN = 0.25
+"""With less of a lead, a low score is not explained by little overlap alone."""
 
 HOPELESS_SUPPORT = 0.04
 """Answers that explain a smaller share of what the network matched are hardly ever right."""
@@ -68,7 +71,7 @@ class Look:
         """Whether the two scans may have been given normals on opposite sides."""
         sheet = min(self.prepared.source.outwardness, self.prepared.target.outwardness) < CLEAR_OUTWARDNESS
         # A low score is what little overlap looks like, too: then the lead over the rivals tells.
-        weak = self.estimate.score < CLEAR_SCORE and self.estimate.margin < UNCLEAR_MARGIN[1]
+        weak = self.estimate.score < CLEAR_SCORE and self.estimate.margin < WEAK_MARGIN
         return not self.estimate.shared_points and (sheet or weak)
 
     def joined(self, other: Look) -> Look:
@@ -115,7 +118,7 @@ def look(see: See, prepared: PreparedPair, solver: str = "auto", prior: Prior = 
     try:
         if prior.initial is not None:  # scaled and shifted, but not turned
             prior = replace(prior, initial=prepared.normalise(prior.initial))
-        estimate = solve(problem, solver, prior)
+        estimate = solve(problem, solver, prior, view.verify)
     except ValueError as error:
         raise InputError(f"no transformation can be found between these scans: {error}") from error
     return Look(prepared, view, estimate, problem.surfaces)

@@ -36,8 +36,9 @@ if TYPE_CHECKING:
 FEWEST_NODES = 50
 """The network sees at least this many points of a scan that has them."""
 
-RIVAL_LAG = 0.06
-"""A distinct pose whose standing is behind the best one's by less than this is named as a rival."""
+RIVAL_LAG = 0.15
+"""A distinct pose whose standing is behind the best one's by less than this is named as a rival. Nine in
+ten poses that are the same by symmetry are, and one in eight wrong ones beside a right answer."""
 
 COUNTERPART_REACH = 3.0
 """A point has a counterpart within this many spacings of the sparser scan."""

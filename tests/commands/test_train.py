@@ -76,10 +76,11 @@ def test_where_there_is_no_terminal_each_record_is_a_plain_line(cli, trainer, tm
     assert f"8/100 pairs, {common}, overlap 0.5" in lines
     assert f"10/100 pairs, {common}, overlap 0.5, hit rate 25.0 %" in lines
     assert f"12/100 pairs, {common}, overlap 0.5, hit rate 37.5 % ▲12.5" in lines
-    assert lines[-4:] == [
+    assert lines[-5:] == [
         "12 pairs seen; hit rate 37.5 % (at first 25.0 %)",
         f"wrote {out}/utopic.safetensors; use it: utopic align SOURCE TARGET --weights "
         f"{out}/utopic.safetensors",
+        f"so that it chooses well among poses: utopic teach {out}/utopic.safetensors",
         f"so that its answers can be trusted: utopic calibrate {out}/utopic.safetensors",
         f"curves: {out}/curves.html",
     ]

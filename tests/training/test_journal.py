@@ -73,6 +73,7 @@ def test_a_new_run_starts_with_an_empty_journal(tmp_path):
         journal.write(record(4))
     assert lines(tmp_path) == [record(4)]
     assert scalars(tmp_path)["loss/overlap"] == [(4, 0.5)]
+    assert len(list((tmp_path / "tensorboard").glob("events.*"))) == 1  # whatever a reader's order
 
 
 def test_a_half_written_last_line_is_dropped_in_silence(tmp_path, caplog):

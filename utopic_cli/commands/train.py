@@ -13,6 +13,8 @@ from utopic_cli.commands.console import SHAPES, Console, Debug, Device, Quiet
 from utopic_cli.errors import OutputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from utopic_cli.synthesis.shapes import ShapeLibrary
 
 RUN_FILES = ("checkpoint.pt", "utopic.safetensors", "utopic.json")
@@ -73,14 +75,14 @@ def train(
     with console.progress() as step:
         step("loading libraries")
         from utopic_cli.commands.training_view import TrainingView
-        from utopic_cli.model.weights import choose_device, load_weights
+        from utopic_cli.model.weights import choose_device
         from utopic_cli.training.config import read_training_config
         from utopic_cli.training.pace import InterruptedRun
         from utopic_cli.training.trainer import train as run_training
 
         settings = read_training_config(config)
         place = choose_device(device)
-        first = load_weights(start_from)[0].state_dict() if start_from else None
+        first = _network_of(start_from) if start_from else None
     shapes = load_library(data, console, resume)
     counts = {split: len(shapes.select(split)) for split in ("train", "val")}
     console.line(f"training on {place} with {counts['train']} shapes, {counts['val']} more to validate")
@@ -104,6 +106,14 @@ def train(
         raise
     for line in (view.outcome(), *describe_files(out, written, data)):
         console.line(line)
+
+
+def _network_of(weights: str) -> dict[str, Tensor]:
+    """Return the tensors of some weights, less the verifier: it learned from another network's matches."""
+    from utopic_cli.model.weights import load_weights
+
+    tensors = load_weights(weights)[0].state_dict()
+    return {name: tensor for name, tensor in tensors.items() if not name.startswith("verifier.")}
 
 
 def check_run(out: Path, resume: bool) -> None:
@@ -155,6 +165,7 @@ def describe_files(out: Path, weights: Path, data: str) -> list[str]:
     library = f" --data {shlex.quote(data)}" if data != PROCEDURAL else ""
     lines = [
         f"wrote {weights}; use it: utopic align SOURCE TARGET --weights {weights}",
+        f"so that it chooses well among poses: utopic teach {weights}{library}",
         f"so that its answers can be trusted: utopic calibrate {weights}{library}",
     ]
     if (out / "curves.html").is_file():

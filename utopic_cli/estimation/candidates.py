@@ -27,11 +27,12 @@ MERGE_DISTANCE = 8.0  # voxels
 REFINED = 8  # measured: what ranks lower after screening never turns out best
 REFINED_SPARSE = 30  # partners may yet speak for it
 APPROACHED = 3
+PLAUSIBILITY_WEIGHT = 0.1  # of a log-odds, in voxels
 LEAST_SUPPORT = 1e-3  # of the correspondences' weight: less is the same
 MOST_TURNING = 0.5  # beyond it, normals contradict each other
 MOST_CONFLICT = 0.3
-SCREENING = (Stage(5.0, 6, 250), Stage(3.0, 4, 250))
-COARSE = (Stage(3.0, 8, 1000), Stage(1.2, 8, 1000))
+SCREENING = (Stage(5.0, 6, 125), Stage(3.0, 4, 125))
+COARSE = (Stage(3.0, 8, 500), Stage(1.2, 8, 500))
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Candidate:
         origin: ``consensus``, ``assignment`` or ``initial``.
         support: share of the correspondences' weight that it explains.
         meeting: how the surfaces lie on each other; None until it is weighed.
+        plausibility: log-odds that it is right, of a verifier that saw it close up; 0 without one.
     """
 
     T_target_source: np.ndarray
@@ -55,6 +57,7 @@ class Candidate:
     origin: str
     support: float = 0.0
     meeting: Meeting | None = None
+    plausibility: float = 0.0
 
     @property
     def standing(self) -> float:
@@ -64,7 +67,8 @@ class Candidate:
         (a nearly symmetric thing, half a turn off) better than a right one of scans that share little.
         Under the right one the surfaces lie closer where they meet (which says the more the more they
         turn there: flat on flat is always close), more of the correspondences are explained, and hardly
-        anything stands where the other scan saw nothing.
+        anything stands where the other scan saw nothing. A verifier, which has seen more than such
+        averages, has the last word.
 
         Raises:
             ValueError: it was not weighed.
@@ -74,7 +78,8 @@ class Candidate:
         support = np.log10(max(self.support, LEAST_SUPPORT))
         shape = min(self.meeting.turning, MOST_TURNING)
         conflict = min(self.meeting.conflict, MOST_CONFLICT)
-        return float(0.08 * support - self.meeting.looseness + 0.2 * shape - 0.7 * conflict)
+        by_surfaces = 0.08 * support - self.meeting.looseness + 0.2 * shape - 0.7 * conflict
+        return float(by_surfaces + PLAUSIBILITY_WEIGHT * self.plausibility)
 
 
 def screen(

@@ -40,6 +40,7 @@ class Evidence:
             rival; from ``MOST_MARGIN`` on, more of it says no more.
         alone: 1 if no other candidate was found at all, else 0: then ``margin`` and ``support_lead`` are
             the most there are, and say little. Less is better.
+        plausibility: log-odds of the verifier for the answer; 0 without one.
         support: log10 of the share of the correspondences' weight that the transformation explains.
         support_lead: log10 of that share over what the best supported rival explains.
         explained: natural logarithm of one plus the number of correspondences explained.
@@ -64,6 +65,7 @@ class Evidence:
     completeness: float
     margin: float
     alone: float
+    plausibility: float
     support: float
     support_lead: float
     explained: float
@@ -149,6 +151,7 @@ def collect_evidence(
         completeness=max(overlap - 0.9, 0.0) / 0.1,
         margin=float(np.log10(min(estimate.margin, MOST_MARGIN) + NO_MARGIN)),
         alone=float(not estimate.rivals),
+        plausibility=estimate.best.plausibility,
         support=float(support),
         support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
         explained=float(np.log1p(len(estimate.correspondences))),
@@ -173,7 +176,7 @@ def _spread_of_residuals(median: float, high: float) -> float:
     return min(high / median, MOST_RESIDUAL) if median * MOST_RESIDUAL > high else MOST_RESIDUAL
 
 
-MOST_MARGIN = 0.2
+MOST_MARGIN = 1.0
 NO_MARGIN = 0.005
 NO_CONFLICT = 0.003
 NO_OVERLAP = 0.01

@@ -16,6 +16,14 @@ from utopic_cli.point_cloud import PointCloud
 
 SURFACE_NEIGHBOURS = 20
 ITERATIONS = 12
+DAMPING = 1e-4
+COARSE_DAMPING = 1e-2
+"""Where few or noisy points hardly fix a motion, what the start says of it is better than what they say."""
+
+NO_WORSE = 0.01
+"""A mean residual larger by this share, of itself or of what it is short of nothing meeting, is no worse:
+noise decides, and the robust fit is the better guess."""
+
 MOST_PARTNERS = 5_000
 """Clouds of more points than this are not asked whether they share points: dense surfaces fix a
 pose as well."""
@@ -28,7 +36,7 @@ class Stage:
     Attributes:
         radius: partners farther than this many voxels are ignored.
         iterations: most steps.
-        samples: points of the source used.
+        samples: points of each scan used.
     """
 
     radius: float
@@ -59,10 +67,12 @@ class Refinement:
 def refine_coarse(
     source: Surface, target: Surface, transformations: np.ndarray, stages: tuple[Stage, ...]
 ) -> np.ndarray:
-    """Run point-to-plane ICP from H transformations at once.
+    """Run symmetric ICP from H transformations at once.
 
-    Partners are nearest target points within the stage's radius whose normal points the
-    same way; nearer ones weigh more. A hypothesis stops when its steps become tiny.
+    Partners are nearest points of the other scan, both ways, within the stage's radius, whose normals point
+    the same way; nearer ones weigh more. What is made small is their distance along the mean of both
+    normals: the noise of two normals cancels in part, and of a curved surface the error is of higher order
+    than with one. A hypothesis stops when its steps become tiny.
 
     Args:
         source: the scan that moves.
@@ -75,40 +85,64 @@ def refine_coarse(
     """
     current = transformations.copy()
     for stage in stages:
-        chosen = source.sample[:: max(1, len(source.sample) // stage.samples)]
-        points, normals = source.points[chosen], source.normals[chosen]
+        of_source, of_target = (
+            surface.sample[:: max(1, len(surface.sample) // stage.samples)] for surface in (source, target)
+        )
         radius = stage.radius * target.voxel
         moving = np.arange(len(current))
         for _ in range(stage.iterations):
             if not len(moving):
                 break
-            step, size = _coarse_step(points, normals, target, current[moving], radius)
+            step, size = _coarse_step(source, target, of_source, of_target, current[moving], radius)
             current[moving] = step @ current[moving]
             moving = moving[size > 0.02 * target.voxel]
     return current
 
 
 def _coarse_step(
-    points: np.ndarray, normals: np.ndarray, target: Surface, transformations: np.ndarray, radius: float
+    source: Surface,
+    target: Surface,
+    source_sample: np.ndarray,
+    target_sample: np.ndarray,
+    transformations: np.ndarray,
+    radius: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """One Gauss-Newton step for (H, 4, 4) -> (H, 4, 4) increments and their (H,) sizes."""
-    rotations = transformations[:, :3, :3].transpose(0, 2, 1)
-    moved = points @ rotations + transformations[:, None, :3, 3]  # (H, S, 3)
-    turned = normals @ rotations
-    distance, index = nearest(target.tree, moved, within=radius)
-    index = np.minimum(index, len(target.points) - 1)  # "none" is len(points)
-    plane = target.normals[index]
-    agree = np.einsum("hsd,hsd->hs", turned, plane)
-    near = np.isfinite(distance) & (agree > 0.5)
-    weight = np.where(near, 1.0 - (np.where(near, distance, 0.0) / radius) ** 2, 0.0)
+    rotations = transformations[:, :3, :3]
+    shifts = transformations[:, None, :3, 3]
+    points, normals = source.points[source_sample], source.normals[source_sample]
+    there, weight_there = _partners(
+        points @ rotations.transpose(0, 2, 1) + shifts, normals @ rotations.transpose(0, 2, 1), target, radius
+    )
+    fixed, fixed_normals = target.points[target_sample], target.normals[target_sample]
+    here, weight_here = _partners((fixed - shifts) @ rotations, fixed_normals @ rotations, source, radius)
+    # Every pair once more, as (moved point, fixed point) with their normals: (H, 2 S, 3).
+    index = np.concatenate([np.broadcast_to(source_sample, there.shape), here], axis=1)
+    moved = source.points[index] @ rotations.transpose(0, 2, 1) + shifts
+    turned = source.normals[index] @ rotations.transpose(0, 2, 1)
+    index = np.concatenate([there, np.broadcast_to(target_sample, here.shape)], axis=1)
+    plane = turned + target.normals[index]
+    plane /= np.maximum(np.linalg.norm(plane, axis=2, keepdims=True), 1e-300)
     offset = np.einsum("hsd,hsd->hs", target.points[index] - moved, plane)
     centre = moved.mean(axis=1, keepdims=True)
-    jacobian = np.concatenate([np.cross(moved - centre, plane), plane], axis=2)  # (H, S, 6)
-    return _solve_step(jacobian, weight, offset, centre[:, 0])
+    jacobian = np.concatenate([np.cross(moved - centre, plane), plane], axis=2)  # (H, 2 S, 6)
+    weight = np.concatenate([weight_there, weight_here], axis=1)
+    return _solve_step(jacobian, weight, offset, centre[:, 0], COARSE_DAMPING)
+
+
+def _partners(
+    points: np.ndarray, normals: np.ndarray, fixed: Surface, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the partners of (H, S, 3) points -> (H, S) rows of the surface and weights, 0 for none."""
+    distance, index = nearest(fixed.tree, points, within=radius)
+    index = np.minimum(index, len(fixed.points) - 1)  # "none" is len(points)
+    agree = np.einsum("hsd,hsd->hs", normals, fixed.normals[index])
+    near = np.isfinite(distance) & (agree > 0.5)
+    return index, np.where(near, 1.0 - (np.where(near, distance, 0.0) / radius) ** 2, 0.0)
 
 
 def _solve_step(
-    jacobian: np.ndarray, weight: np.ndarray, offset: np.ndarray, centre: np.ndarray
+    jacobian: np.ndarray, weight: np.ndarray, offset: np.ndarray, centre: np.ndarray, damp: float = DAMPING
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve B weighted point-to-plane problems.
 
@@ -117,6 +151,7 @@ def _solve_step(
         weight: (B, S).
         offset: (B, S) signed distance to the partner's plane.
         centre: (B, 3).
+        damp: how much is added to the normal matrix, in proportion to it.
 
     Returns:
         increments: (B, 4, 4) rigid.
@@ -131,7 +166,7 @@ def _solve_step(
     spread /= np.sqrt(jacobian.shape[1])
     total = np.maximum(weight.sum(axis=1), 1e-12)
     damping = np.repeat(np.stack([spread**2 * total, total], axis=1), 3, axis=1)  # (B, 6)
-    normal_matrix[:, np.arange(6), np.arange(6)] += 1e-4 * damping
+    normal_matrix[:, np.arange(6), np.arange(6)] += damp * damping
     solution = np.linalg.solve(normal_matrix, right[..., None])[..., 0]  # (B, 6)
     solution[np.count_nonzero(weight, axis=1) < 6] = 0.0
     rotation = _rotations(solution[:, :3])
@@ -163,7 +198,7 @@ def refine(
     limit: int = 50_000,
     trees: tuple[cKDTree, cKDTree] | None = None,
 ) -> Refinement:
-    """Refine one transformation at full resolution, and keep it only where the fit improves.
+    """Refine one transformation at full resolution, and keep it unless the fit becomes worse.
 
     Symmetric point-to-plane ICP: distances are measured along the mean of both normals. The
     search radius shrinks from ``radius`` to a few times the points' own spacing, following the
@@ -181,7 +216,7 @@ def refine(
         trees: of all points of source and target, if there are any already.
 
     Returns:
-        The better of the refined and the given transformation, with its residual; for clouds
+        The refined transformation, or the given one where that fits better, with its residual; for clouds
         that share points, the fit to those, whatever its residual.
 
     Raises:
@@ -212,8 +247,8 @@ def refine(
     fitted = _fit_partners(moving, fixed, np.stack([T, current]))
     if fitted is not None:
         return Refinement(fitted, _residual(moving, fixed, fitted, threshold), before, True, threshold)
-    improved = bool(after < before)
-    return Refinement(current if improved else T, min(after, before), before, improved, threshold)
+    kept = bool(after < before + NO_WORSE * min(before, threshold - before))
+    return Refinement(current if kept else T, after if kept else before, before, kept, threshold)
 
 
 class _FullSurface:

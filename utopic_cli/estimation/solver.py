@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from utopic_cli.estimation.candidates import Candidate, CoarseRefinement, refine_candidates, screen, weigh
+from utopic_cli.estimation.close_up import CloseUp, close_ups
 from utopic_cli.estimation.consensus import Hypothesis, consensus_hypotheses, distinct
 from utopic_cli.estimation.correspondences import (
     candidate_correspondences,
@@ -24,6 +26,7 @@ PROPOSED = 200
 FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
 RIVALS = 5
+VERIFIED = 8  # best candidates that are looked at closely
 SAME_PLACE = 0.15  # of the source's radius: what two samplings' answers to one question may differ by
 
 
@@ -89,7 +92,12 @@ class Estimate:
         return replace(self, rivals=tuple(rivals[i - 1] for i in kept))
 
 
-def solve(problem: Problem, solver: str = "auto", prior: Prior = ANYWHERE) -> Estimate:
+def solve(
+    problem: Problem,
+    solver: str = "auto",
+    prior: Prior = ANYWHERE,
+    verify: Callable[[Sequence[CloseUp]], np.ndarray] | None = None,
+) -> Estimate:
     """Find the transformation of one pair.
 
     Args:
@@ -100,6 +108,7 @@ def solve(problem: Problem, solver: str = "auto", prior: Prior = ANYWHERE) -> Es
             hypothesis is refined by coarse ICP, and verification chooses.
         prior: what is known beforehand: a transformation to try as well (with ``svd``: the better of
             the two), and how far the source may be turned; what is turned farther is no candidate.
+        verify: log-odds (C,) that candidates seen close up are right, or None: then the surfaces decide.
 
     Returns:
         The best transformation with its rivals. The same input gives the same output.
@@ -143,6 +152,8 @@ def solve(problem: Problem, solver: str = "auto", prior: Prior = ANYWHERE) -> Es
     chosen = weigh(problem, partners or chosen, correspondences, tolerance, source, target)
     if refine and not partners:
         chosen.sort(key=lambda candidate: -candidate.standing)
+        if verify is not None:
+            chosen = _verified(problem, chosen[:VERIFIED], verify)
     best = chosen[0]
     return Estimate(
         best=best,
@@ -154,6 +165,14 @@ def solve(problem: Problem, solver: str = "auto", prior: Prior = ANYWHERE) -> Es
         method=best.origin if solver == "auto" else solver,
         shared_points=bool(partners),
     )
+
+
+def _verified(
+    problem: Problem, candidates: list[Candidate], verify: Callable[[Sequence[CloseUp]], np.ndarray]
+) -> list[Candidate]:
+    odds = verify(close_ups(problem, candidates))
+    seen = [replace(each, plausibility=float(one)) for each, one in zip(candidates, odds, strict=True)]
+    return sorted(seen, key=lambda candidate: -candidate.standing)
 
 
 def _admitted(hypotheses: list[Hypothesis], prior: Prior) -> list[Hypothesis]:

@@ -15,6 +15,7 @@ from utopic_cli.model.geometric_embedding import geometric_embedding
 from utopic_cli.model.hypothesis import HYPOTHESIS_FEATURES, hypothesis_features, inverse
 from utopic_cli.model.matching import AffinityMatching
 from utopic_cli.model.overlap_head import OverlapHead
+from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.model.uncertainty import (
     OverlapDistribution,
     UncertaintyQuantification,
@@ -76,12 +77,20 @@ class Prediction(NamedTuple):
 
 
 class Utopic(nn.Module):
-    """The inference network. Training wraps it and adds what only training needs."""
+    """The inference network. Training wraps it and adds what only training needs.
+
+    Attributes:
+        config: its architecture.
+        verifier: what chooses among poses; None until one has learned to (see ``teach_verifier``).
+    """
+
+    verifier: PoseVerifier | None
 
     def __init__(self, config: ModelConfig) -> None:
         """Build with random weights; ``weights.load_weights`` builds a trained one."""
         super().__init__()
         self.config = config
+        self.verifier = None
         width = config.feature_width
         self.extractor = FeatureExtractor(config)
         self.first_transformer = GeometryTransformer(config)

@@ -15,6 +15,7 @@ from safetensors.torch import save as save_tensors
 from utopic_cli.config import ModelConfig, from_dict, to_dict
 from utopic_cli.errors import InputError
 from utopic_cli.model.bundled import bundled_weights
+from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.model.utopic import Utopic
 
 
@@ -76,6 +77,7 @@ def load_weights(name_or_path: str) -> tuple[Utopic, dict[str, Any]]:
     if card.get("sha256", digest) != digest:
         raise InputError(f"{path}: the file differs from the one its card describes (sha256 {digest[:12]})")
     model = Utopic(from_dict(ModelConfig, card["model"], str(path.with_suffix(".json"))))
+    model.verifier = _verifier(card, path)
     try:
         tensors = {name: tensor.float() for name, tensor in load_tensors(blob).items()}
         model.load_state_dict(tensors, strict=True)
@@ -85,14 +87,39 @@ def load_weights(name_or_path: str) -> tuple[Utopic, dict[str, Any]]:
     return model.eval(), {**card, "name": path.stem, "sha256": digest}
 
 
+def _verifier(card: dict[str, Any], path: Path) -> PoseVerifier | None:
+    """Build the verifier that the card describes, if it has one.
+
+    Raises:
+        InputError: its sizes make no sense.
+    """
+    section = card.get("verifier")
+    if section is None:
+        return None
+    sizes = section.get("sizes") if isinstance(section, dict) else None
+    names = ("point_features", "whole_features", "width")
+    if not isinstance(sizes, dict) or not all(
+        type(sizes.get(name)) is int and sizes[name] > 0 for name in names
+    ):
+        raise InputError(f"{path.with_suffix('.json')}: the verifier's sizes can't be read")
+    return PoseVerifier(*(sizes[name] for name in names))
+
+
 def pack_weights(model: Utopic, card: dict[str, Any]) -> tuple[bytes, bytes]:
-    """Return a network as the bytes of its float16 safetensors file and of its JSON card."""
+    """Return a network as the bytes of its float16 safetensors file and of its JSON card.
+
+    Args:
+        model: with its verifier, if it has one.
+        card: what there is to say of it; architecture, the verifier's sizes and the hash are added.
+    """
     tensors = {
         name: (tensor.half() if tensor.is_floating_point() else tensor).contiguous().cpu()
         for name, tensor in model.state_dict().items()
     }
     blob = save_tensors(tensors)
     full = {**card, "model": to_dict(model.config), "sha256": hashlib.sha256(blob).hexdigest()}
+    if model.verifier is not None:
+        full["verifier"] = {**card.get("verifier", {}), "sizes": model.verifier.sizes}
     text = json.dumps(full, indent=2, allow_nan=False) + "\n"
     return blob, text.encode("utf-8")
 

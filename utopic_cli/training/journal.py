@@ -171,13 +171,17 @@ def _parse(line: str) -> dict[str, Any] | None:
 def _open_events(folder: Path, done: int) -> Any:
     """Return a TensorBoard writer, or None where that package isn't installed.
 
-    Events after the resumed place (all of them for a new run) are marked as undone.
+    Events after the resumed place are marked as undone. A new run takes away those of a run before: files
+    begun in one second are read in the order of their names, in which a mark may come before what it undoes.
     """
     if importlib.util.find_spec("tensorboard") is None:
         return None
     from torch.utils.tensorboard import SummaryWriter
 
     try:
+        if not done:
+            for old in folder.glob("events.out.tfevents.*"):
+                old.unlink()
         return SummaryWriter(str(folder), purge_step=done + 1 if done else 0)
     except OSError as error:
         log.warning("%s: can't be written (%s); no TensorBoard events", folder, error.strerror)

@@ -1,0 +1,80 @@
+"""Teaching a verifier: lessons of the solve's own poses, and a fit that finds what they differ in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from utopic_cli.benchmark.teaching import FEWEST, Lesson, fit, learn, lesson_of, plausible
+from utopic_cli.errors import InputError
+from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
+from utopic_cli.synthesis.packing import open_shapes
+
+
+def made_up(number: int, tell: float = 1.5) -> Lesson:
+    """Four poses, one of them right: its points differ in one feature by ``tell`` on average."""
+    rng = np.random.default_rng(number)
+    points = rng.standard_normal((4, 2 * NODES - 40, POINT_FEATURES))
+    right = np.arange(4) == number % 4
+    points[right, :, 3] += tell
+    whole = rng.standard_normal((4, WHOLE_FEATURES)).astype(np.float32)
+    proposed = np.array([True, True, True, number % 5 > 0])
+    return Lesson(
+        "scans", f"shape {number}", points.astype(np.float16), whole, right, proposed, rng.standard_normal(4)
+    )
+
+
+@pytest.fixture(scope="module")
+def lessons() -> list[Lesson]:
+    return [made_up(number) for number in range(60)]
+
+
+def test_it_learns_what_right_poses_have_in_common(lessons):
+    verifier = fit(lessons, seed=0)
+    others = [made_up(number) for number in range(1000, 1040)]
+    odds = [plausible(verifier, lesson) for lesson in others]
+    assert sum(lesson.right[one.argmax()] for lesson, one in zip(others, odds)) >= 36
+    nothing = [made_up(number, tell=0.0) for number in range(1000, 1040)]
+    found = sum(lesson.right[plausible(verifier, lesson).argmax()] for lesson in nothing)
+    assert found <= 24  # ten by chance
+
+
+def test_the_same_seed_learns_the_same(lessons):
+    first, second, other = (fit(lessons[:44], seed) for seed in (1, 1, 2))
+    for name, value in first.state_dict().items():
+        assert np.array_equal(value, second.state_dict()[name]), name
+    assert not np.array_equal(first.attention.weight.detach(), other.attention.weight.detach())
+
+
+def test_it_is_measured_on_shapes_left_out(lessons):
+    told = []
+    _, described = learn(lessons, {"data": "x"}, 0, lambda *step: told.append(step))
+    assert described["data"] == "x" and described["pairs"] == 60 and described["right"] == 60
+    count = described["out_of_fold"]["scans"]
+    # The known answer is shown, but no credit is given for knowing it.
+    proposed = sum(bool(lesson.right[lesson.proposed].any()) for lesson in lessons)
+    assert count["right_proposed"] == proposed < 60
+    assert count["first_by_verifier"] > 0.8 * proposed > count["first_by_surfaces"]
+    assert len(told) == 4
+
+
+def test_too_few_lessons_are_refused(lessons):
+    with pytest.raises(InputError, match=f"{FEWEST} are needed"):
+        learn(lessons[: FEWEST - 1], {}, 0)
+
+
+@pytest.mark.slow
+def test_a_lesson_holds_the_known_answer_and_what_the_solve_proposed():
+    shapes = open_shapes("procedural").select("train")
+    found = [lesson_of("utopic", shapes, "procedural", 3, number) for number in range(4)]
+    again = lesson_of("utopic", shapes, "procedural", 3, 1)
+    lessons = [lesson for lesson in found if lesson is not None]
+    assert len(lessons) >= 3
+    for lesson in lessons:
+        count = len(lesson.right)
+        assert lesson.points.shape[0] == lesson.whole.shape[0] == len(lesson.by_surfaces) == count
+        assert lesson.points.shape[2] == POINT_FEATURES and np.isfinite(lesson.points).all()
+        if lesson.kind in ("different", "mirrored"):
+            assert not lesson.right.any() and lesson.proposed.all()
+    assert any(lesson.right.any() and not lesson.right.all() for lesson in lessons)
+    assert again is not None and found[1] is not None and np.array_equal(again.points, found[1].points)

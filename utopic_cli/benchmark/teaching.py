@@ -1,0 +1,324 @@
+"""Teaching a verifier: what right and wrong poses look like close up, of simulated pairs.
+
+The wrong ones are those that the solve itself proposes, which is what the verifier will have to tell from
+right ones: half turns, neighbours in a row, and whatever fits of scans that share nothing.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from utopic_cli.benchmark.held_out import made_of
+from utopic_cli.benchmark.pair_metrics import measure_pose
+from utopic_cli.benchmark.pool import each
+from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
+from utopic_cli.bridge import load_network, predict
+from utopic_cli.errors import InputError
+from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES, close_ups
+from utopic_cli.estimation.prior import ANYWHERE, Prior
+from utopic_cli.estimation.problem import Problem
+from utopic_cli.estimation.solver import solve
+from utopic_cli.model.pose_verifier import PoseVerifier
+from utopic_cli.point_cloud import PointCloud
+from utopic_cli.preprocess import PreparedPair, prepare
+from utopic_cli.synthesis.scan_pair import ScanPair
+from utopic_cli.synthesis.settings import PairSettings
+from utopic_cli.synthesis.shapes import ShapeLibrary
+
+MIXTURE: tuple[tuple[float, AnyProtocol], ...] = (
+    (0.22, CropProtocol("keep 0.7", 0.7, "independent", "uniform")),
+    (0.20, CropProtocol("keep 0.5", 0.5, "independent", "uniform")),
+    (0.24, RangeProtocol(bands=((0.1, 0.3),), name="overlap 0.1-0.3")),
+    (0.14, RangeProtocol(bands=((0.3, 0.5),), name="overlap 0.3-0.5")),
+    (0.05, RangeProtocol(bands=((0.5, 0.9),), name="overlap 0.5-0.9")),
+    (
+        0.15,
+        RangeProtocol(
+            ((0.15, 0.6),), replace(PairSettings(), several_views_probability=1.0), "several views"
+        ),
+    ),
+)
+"""What the pairs are, with their shares."""
+
+DIFFERENT, MIRRORED = 0.10, 0.05
+"""Shares of pairs that nothing puts right: scans of two shapes, and of a shape and its mirror image."""
+
+OTHERS = 1_000_000
+"""Added to the seed for the second shape."""
+
+POINTS = 1024
+WIDTH = 64
+EPOCHS = 10
+BATCH = 12  # pairs
+RATE = 3e-3
+WEIGHT_DECAY = 0.02
+BY_ITSELF = 0.5
+"""Weight of each pose's own right or wrong, beside which pose of a pair is the right one."""
+
+FOLDS = 3
+FEWEST = 30
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """The candidates of one pair.
+
+    Attributes:
+        kind: of the pair.
+        shape: what was scanned.
+        points: (C, P, F) float16, of each candidate's close-up.
+        whole: (C, G) float32.
+        right: (C,) whether it is right, or as good by symmetry.
+        proposed: (C,) whether the solve came upon it; False for the known answer itself.
+        by_surfaces: (C,) its standing by the surfaces alone.
+    """
+
+    kind: str
+    shape: str
+    points: np.ndarray
+    whole: np.ndarray
+    right: np.ndarray
+    proposed: np.ndarray
+    by_surfaces: np.ndarray
+
+
+def teach(
+    weights: str,
+    shapes: ShapeLibrary,
+    data: str,
+    pairs: int,
+    seed: int,
+    workers: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> tuple[PoseVerifier, dict[str, Any]]:
+    """Teach a verifier for some weights.
+
+    Args:
+        weights: as of ``load_network``.
+        shapes: a library; only its ``train`` shapes are used.
+        data: what to call it.
+        pairs: how many to make.
+        seed: of the pairs and of the verifier's first weights.
+        workers: processes that solve pairs; the result does not depend on their number.
+        progress: called with (done, in all, what goes on).
+
+    Returns:
+        The verifier, and what to write about it into the card.
+
+    Raises:
+        InputError: no pairs can be made of the shapes, or too few poses are right or wrong.
+    """
+    train = shapes.select("train")
+    if not len(train):
+        raise InputError(f"{data}: has no shapes to learn from")
+
+    def tell(done: int, of: int) -> None:
+        if progress is not None:
+            progress(done, of, f"poses for pairs of {data}")
+
+    found = each(partial(_task, weights, train, data, seed), pairs, workers, tell)
+    lessons = [lesson for lesson in found if lesson is not None]
+    about = {"data": data, "shapes": len(train), "seed": seed}
+    return learn(lessons, about, seed, progress)
+
+
+def learn(
+    lessons: Sequence[Lesson],
+    about: dict[str, Any],
+    seed: int,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> tuple[PoseVerifier, dict[str, Any]]:
+    """Fit a verifier to lessons, after measuring it on shapes left out in turn.
+
+    Raises:
+        InputError: too few lessons, or all of one kind.
+    """
+    both = sum(bool(lesson.right.any() and not lesson.right.all()) for lesson in lessons)
+    if both < FEWEST:
+        raise InputError(
+            f"only {both} pairs have right and wrong poses; {FEWEST} are needed, so give more pairs"
+        )
+    fold = np.array([zlib.crc32(lesson.shape.encode()) % FOLDS for lesson in lessons])
+    held: list[tuple[Lesson, np.ndarray]] = []
+    for number in range(FOLDS):
+        if progress is not None:
+            progress(number, FOLDS + 1, "learning")
+        rest = [lesson for lesson, its in zip(lessons, fold, strict=True) if its != number]
+        verifier = fit(rest, seed)
+        held += [
+            (lesson, plausible(verifier, lesson))
+            for lesson, its in zip(lessons, fold, strict=True)
+            if its == number
+        ]
+    if progress is not None:
+        progress(FOLDS, FOLDS + 1, "learning")
+    description = {
+        **about,
+        "pairs": len(lessons),
+        "poses": int(sum(len(lesson.right) for lesson in lessons)),
+        "right": int(sum(lesson.right.sum() for lesson in lessons)),
+        "epochs": EPOCHS,
+        "out_of_fold": _chosen(held),
+    }
+    return fit(lessons, seed), description
+
+
+def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
+    """Train a verifier: of a pair's poses the right one, and of each pose whether it is right.
+
+    Args:
+        lessons: some with right and wrong poses.
+        seed: of the first weights, the order, and which points are looked at.
+    """
+    rng = np.random.default_rng(seed)
+    points = [_evenly(lesson.points) for lesson in lessons]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        verifier = PoseVerifier(POINT_FEATURES, WHOLE_FEATURES, WIDTH)
+        verifier.normalise(
+            torch.from_numpy(np.concatenate([each[:, ::16].reshape(-1, POINT_FEATURES) for each in points])),
+            torch.from_numpy(np.concatenate([lesson.whole for lesson in lessons])),
+        )
+        optimiser = torch.optim.AdamW(verifier.parameters(), RATE, weight_decay=WEIGHT_DECAY)
+        steps = EPOCHS * -(-len(lessons) // BATCH)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
+        for _ in range(EPOCHS):
+            for chosen in _batches(rng.permutation(len(lessons))):
+                some = rng.permutation(2 * NODES)[:NODES]
+                odds = verifier(
+                    torch.from_numpy(np.concatenate([points[i][:, some] for i in chosen])).float(),
+                    torch.from_numpy(np.concatenate([lessons[i].whole for i in chosen])),
+                )
+                loss = _loss(odds, [torch.from_numpy(lessons[i].right) for i in chosen])
+                optimiser.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                nn.utils.clip_grad_norm_(verifier.parameters(), 1.0)
+                optimiser.step()
+                schedule.step()
+    return verifier.eval()
+
+
+def plausible(verifier: PoseVerifier, lesson: Lesson) -> np.ndarray:
+    """Return the log-odds (C,) of a lesson's poses."""
+    with torch.inference_mode():
+        odds = verifier(torch.from_numpy(lesson.points).float(), torch.from_numpy(lesson.whole))
+    return odds.numpy()
+
+
+def _batches(order: np.ndarray) -> Iterator[np.ndarray]:
+    for start in range(0, len(order), BATCH):
+        yield order[start : start + BATCH]
+
+
+def _evenly(points: np.ndarray) -> np.ndarray:
+    """Repeat points of small clouds, so that all lessons have 2 ``NODES``."""
+    return points[:, np.arange(2 * NODES) * points.shape[1] // (2 * NODES)]
+
+
+def _loss(odds: torch.Tensor, right: Sequence[torch.Tensor]) -> torch.Tensor:
+    loss = BY_ITSELF * nn.functional.binary_cross_entropy_with_logits(odds, torch.cat(list(right)).float())
+    for own, is_right in zip(odds.split([len(one) for one in right]), right, strict=True):
+        if is_right.any() and not is_right.all():
+            loss = loss + (own.logsumexp(0) - own[is_right].logsumexp(0)) / len(right)
+    return loss
+
+
+def _chosen(held: Sequence[tuple[Lesson, np.ndarray]]) -> dict[str, Any]:
+    """Count, by kind of pair, where a right pose was proposed, and where it comes first."""
+    counts: dict[str, list[int]] = {}
+    for lesson, odds in held:
+        if not lesson.right[lesson.proposed].any():
+            continue
+        right = lesson.right[lesson.proposed]
+        count = counts.setdefault(lesson.kind, [0, 0, 0])
+        count[0] += 1
+        count[1] += int(right[lesson.by_surfaces[lesson.proposed].argmax()])
+        count[2] += int(right[odds[lesson.proposed].argmax()])
+    names = ("right_proposed", "first_by_surfaces", "first_by_verifier")
+    return {kind: dict(zip(names, counts[kind], strict=True)) for kind in sorted(counts)}
+
+
+def _task(weights: str, shapes: ShapeLibrary, data: str, seed: int) -> Callable[[int], Lesson | None]:
+    return partial(lesson_of, weights, shapes, data, seed)
+
+
+def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: int) -> Lesson | None:
+    """Make pair ``number`` and solve it; None where nothing follows, or single points decide.
+
+    Raises:
+        InputError: no such pair can be made of the shapes.
+    """
+    rng = np.random.default_rng([seed, number])
+    with made_of(data):
+        kind, protocol, pair, possible = _pair(shapes, seed, number, rng)
+    prepared = prepare(pair.source, pair.target, POINTS, clean=protocol.cleans)
+    view = predict(load_network(weights, "cpu")[0], prepared, 0)
+    problem = Problem(
+        prepared.source.points,
+        prepared.target.points,
+        view.matching_scores,
+        view.source_overlap,
+        view.target_overlap,
+        1.0 - view.source_uncertainty,
+        1.0 - view.target_uncertainty,
+        prepared.source.dense,
+        prepared.target.dense,
+        prepared.spacing,
+    )
+    prior = Prior(prepared.normalise(pair.gt_T_target_source)) if possible else ANYWHERE
+    try:
+        estimate = solve(problem, prior=prior)
+    except ValueError:
+        return None
+    if estimate.shared_points:
+        return None
+    candidates = (estimate.best, *estimate.rivals)
+    shown = close_ups(problem, candidates)
+    return Lesson(
+        kind,
+        str(pair.shape),
+        np.stack([one.points for one in shown]).astype(np.float16),
+        np.stack([one.whole for one in shown]),
+        np.array(
+            [possible and _right(each.T_target_source, pair, protocol, prepared) for each in candidates]
+        ),
+        np.array([each.origin != "initial" for each in candidates]),
+        np.array([each.standing for each in candidates]),
+    )
+
+
+def _pair(
+    shapes: ShapeLibrary, seed: int, number: int, rng: np.random.Generator
+) -> tuple[str, AnyProtocol, ScanPair, bool]:
+    """Return the kind of pair ``number``, its protocol, the pair, and whether anything puts it right."""
+    shares = np.cumsum([share for share, _ in MIXTURE])
+    protocol = MIXTURE[int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))][1]
+    pair = protocol.pair(shapes, seed, number)
+    draw = rng.random()
+    if draw < DIFFERENT:
+        other = protocol.pair(shapes, seed + OTHERS, number)
+        return "different", protocol, replace(pair, target=other.target), False
+    if draw < DIFFERENT + MIRRORED:
+        mirror = np.ones(3)
+        mirror[rng.integers(3)] = -1.0
+        return "mirrored", protocol, replace(pair, source=PointCloud(pair.source.points * mirror)), False
+    return protocol.name, protocol, pair, True
+
+
+def _right(T: np.ndarray, pair: ScanPair, protocol: AnyProtocol, prepared: PreparedPair) -> bool:
+    return measure_pose(
+        prepared.denormalise(T),
+        pair.gt_T_target_source,
+        protocol.unit(pair),
+        centre=protocol.centre(pair),
+        object_points=pair.object_points,
+        extent=pair.extent,
+    ).symmetric
