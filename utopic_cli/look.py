@@ -90,6 +90,22 @@ class Look:
         return float(np.clip(np.log10(max(apart, 1e-12)), SAME, 0.0))
 
 
+def problem_of(prepared: PreparedPair, view: NetworkView) -> Problem:
+    """Pose the solver's question: a prepared pair and what was seen in it."""
+    return Problem(
+        source_nodes=prepared.source.points,
+        target_nodes=prepared.target.points,
+        matching_scores=view.matching_scores,
+        source_overlap=view.source_overlap,
+        target_overlap=view.target_overlap,
+        source_certainty=1.0 - view.source_uncertainty,
+        target_certainty=1.0 - view.target_uncertainty,
+        source_dense=prepared.source.dense,
+        target_dense=prepared.target.dense,
+        spacing=prepared.spacing,
+    )
+
+
 def look(see: See, prepared: PreparedPair, solver: str = "auto", prior: Prior = ANYWHERE) -> Look:
     """Look at a pair.
 
@@ -103,18 +119,7 @@ def look(see: See, prepared: PreparedPair, solver: str = "auto", prior: Prior = 
         InputError: no transformation follows from what was seen.
     """
     view = see(prepared)
-    problem = Problem(
-        source_nodes=prepared.source.points,
-        target_nodes=prepared.target.points,
-        matching_scores=view.matching_scores,
-        source_overlap=view.source_overlap,
-        target_overlap=view.target_overlap,
-        source_certainty=1.0 - view.source_uncertainty,
-        target_certainty=1.0 - view.target_uncertainty,
-        source_dense=prepared.source.dense,
-        target_dense=prepared.target.dense,
-        spacing=prepared.spacing,
-    )
+    problem = problem_of(prepared, view)
     try:
         if prior.initial is not None:  # scaled and shifted, but not turned
             prior = replace(prior, initial=prepared.normalise(prior.initial))

@@ -24,8 +24,8 @@ from utopic_cli.bridge import load_network, predict
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES, close_ups
 from utopic_cli.estimation.prior import ANYWHERE, Prior
-from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import solve
+from utopic_cli.look import problem_of
 from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, prepare
@@ -261,18 +261,7 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
         kind, protocol, pair, possible = _pair(shapes, seed, number, rng)
     prepared = prepare(pair.source, pair.target, POINTS, clean=protocol.cleans)
     view = predict(load_network(weights, "cpu")[0], prepared, 0)
-    problem = Problem(
-        prepared.source.points,
-        prepared.target.points,
-        view.matching_scores,
-        view.source_overlap,
-        view.target_overlap,
-        1.0 - view.source_uncertainty,
-        1.0 - view.target_uncertainty,
-        prepared.source.dense,
-        prepared.target.dense,
-        prepared.spacing,
-    )
+    problem = problem_of(prepared, view)
     prior = Prior(prepared.normalise(pair.gt_T_target_source)) if possible else ANYWHERE
     try:
         estimate = solve(problem, prior=prior)
