@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from utopic_cli.benchmark.teaching import FEWEST, Lesson, fit, learn, lesson_of, plausible
+from utopic_cli.benchmark.lessons import TRIALS, Lesson, Question, lesson_of, question_of
+from utopic_cli.benchmark.teaching import FEWEST, fit, learn, plausible
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
+from utopic_cli.geometry import rigid
 from utopic_cli.synthesis.packing import open_shapes
 
 
@@ -61,6 +63,32 @@ def test_it_is_measured_on_shapes_left_out(lessons):
 def test_too_few_lessons_are_refused(lessons):
     with pytest.raises(InputError, match=f"{FEWEST} are needed"):
         learn(lessons[: FEWEST - 1], {}, 0)
+
+
+@pytest.fixture(scope="module")
+def questions() -> list[Question]:
+    shapes = open_shapes("procedural").select("train")
+    return [question_of(shapes, 3, number) for number in range(40)]
+
+
+def test_pairs_are_of_many_kinds_and_made_again_alike(questions):
+    kinds = {question.kind for question in questions}
+    assert len(kinds) >= 8 and kinds & set(TRIALS) and "keep 0.7" in kinds and "overlap 0.1-0.3" in kinds
+    again = question_of(open_shapes("procedural").select("train"), 3, 7)
+    assert np.array_equal(again.source.points, questions[7].source.points)
+    assert again.kind == questions[7].kind
+
+
+def test_the_known_answer_is_right_and_others_are_not(questions):
+    off = rigid.rigid(np.eye(3), np.array([0.0, 0.0, 1000.0]))
+    for question in questions:
+        assert not question.right(off), question.kind
+        if question.answer is not None:
+            assert question.right(question.answer), question.kind
+            assert not question.right(off @ question.answer), question.kind
+    hopeless = [question for question in questions if question.answer is None]
+    assert {question.kind for question in hopeless} & {"disjoint", "different", "mirrored"}
+    assert not any(question.right(np.eye(4)) for question in hopeless)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import lumpy_surface
-from utopic_cli.estimation.meeting import meet, self_agreement
+from utopic_cli.estimation.meeting import MOST_ALIKE, meet, self_agreement
 from utopic_cli.estimation.observability import find_twists, observe, stiffness
 from utopic_cli.estimation.surface import Surface, make_surface
 from utopic_cli.geometry import rigid
@@ -128,8 +128,8 @@ def test_surfaces_that_do_not_meet_have_no_answer():
     assert find_twists(cloud, cloud, rigid.rigid(np.eye(3), np.array([50.0, 0, 0]))) is None
 
 
-def felt(source: Surface, target: Surface, T: np.ndarray, likeness: float, alike: float) -> float:
-    return stiffness(source, target, T, find_twists(source, target, T), likeness, alike)
+def felt(source: Surface, target: Surface, T: np.ndarray, agreement: float, alike: float) -> float:
+    return stiffness(source, target, T, find_twists(source, target, T), agreement, alike)
 
 
 def stiffness_of(shape, **how) -> float:  # type: ignore[no-untyped-def]
@@ -137,7 +137,7 @@ def stiffness_of(shape, **how) -> float:  # type: ignore[no-untyped-def]
         surface(shape(np.random.default_rng(seed), **how), np.array([9.0, 2.0, 9.0])) for seed in (1, 2)
     )
     alike = self_agreement(source, target)
-    return felt(source, target, np.eye(4), meet(source, target, np.eye(4), alike).likeness, alike)
+    return felt(source, target, np.eye(4), meet(source, target, np.eye(4), alike).agreement, alike)
 
 
 @pytest.mark.parametrize("shape", [plane, cylinder])
@@ -155,6 +155,20 @@ def profile(rng: np.random.Generator, notch: float = 0.0) -> np.ndarray:
 def test_a_bar_slides_along_itself_and_a_notch_stops_it() -> None:
     assert stiffness_of(profile) < 0.005
     assert stiffness_of(profile, notch=0.1) > 0.1
+
+
+def test_rough_scans_that_agree_better_than_with_themselves_are_stiff_as_well() -> None:
+    """Their likeness is cut off at its largest, here and displaced: what falls is the agreement."""
+    source, target = (
+        surface(profile(np.random.default_rng(seed), notch=0.2), np.array([9.0, 2.0, 9.0])) for seed in (1, 2)
+    )
+    met = meet(source, target, np.eye(4), 0.3)
+    assert met.likeness == MOST_ALIKE and meet(source, target, shifted(0.1), 0.3).likeness == MOST_ALIKE
+    assert felt(source, target, np.eye(4), met.agreement, 0.3) > 0.1
+
+
+def shifted(along_y: float) -> np.ndarray:
+    return rigid.rigid(np.eye(3), np.array([0.0, along_y, 0.0]))
 
 
 def test_where_nothing_overlaps_nothing_is_stiff() -> None:

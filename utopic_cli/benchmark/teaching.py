@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,45 +15,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from utopic_cli.benchmark.held_out import made_of
-from utopic_cli.benchmark.pair_metrics import measure_pose
+from utopic_cli.benchmark.lessons import Lesson, lesson_of
 from utopic_cli.benchmark.pool import each
-from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
-from utopic_cli.bridge import load_network, predict
 from utopic_cli.errors import InputError
-from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES, close_ups
-from utopic_cli.estimation.prior import ANYWHERE, Prior
-from utopic_cli.estimation.solver import solve
-from utopic_cli.look import problem_of
+from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
 from utopic_cli.model.pose_verifier import PoseVerifier
-from utopic_cli.point_cloud import PointCloud
-from utopic_cli.preprocess import PreparedPair, prepare
-from utopic_cli.synthesis.scan_pair import ScanPair
-from utopic_cli.synthesis.settings import PairSettings
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
-MIXTURE: tuple[tuple[float, AnyProtocol], ...] = (
-    (0.22, CropProtocol("keep 0.7", 0.7, "independent", "uniform")),
-    (0.20, CropProtocol("keep 0.5", 0.5, "independent", "uniform")),
-    (0.24, RangeProtocol(bands=((0.1, 0.3),), name="overlap 0.1-0.3")),
-    (0.14, RangeProtocol(bands=((0.3, 0.5),), name="overlap 0.3-0.5")),
-    (0.05, RangeProtocol(bands=((0.5, 0.9),), name="overlap 0.5-0.9")),
-    (
-        0.15,
-        RangeProtocol(
-            ((0.15, 0.6),), replace(PairSettings(), several_views_probability=1.0), "several views"
-        ),
-    ),
-)
-"""What the pairs are, with their shares."""
-
-DIFFERENT, MIRRORED = 0.10, 0.05
-"""Shares of pairs that nothing puts right: scans of two shapes, and of a shape and its mirror image."""
-
-OTHERS = 1_000_000
-"""Added to the seed for the second shape."""
-
-POINTS = 1024
 WIDTH = 64
 EPOCHS = 10
 BATCH = 12  # pairs
@@ -65,29 +32,6 @@ BY_ITSELF = 0.5
 
 FOLDS = 3
 FEWEST = 30
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """The candidates of one pair.
-
-    Attributes:
-        kind: of the pair.
-        shape: what was scanned.
-        points: (C, P, F) float16, of each candidate's close-up.
-        whole: (C, G) float32.
-        right: (C,) whether it is right, or as good by symmetry.
-        proposed: (C,) whether the solve came upon it; False for the known answer itself.
-        by_surfaces: (C,) its standing by the surfaces alone.
-    """
-
-    kind: str
-    shape: str
-    points: np.ndarray
-    whole: np.ndarray
-    right: np.ndarray
-    proposed: np.ndarray
-    by_surfaces: np.ndarray
 
 
 def teach(
@@ -248,66 +192,3 @@ def _chosen(held: Sequence[tuple[Lesson, np.ndarray]]) -> dict[str, Any]:
 
 def _task(weights: str, shapes: ShapeLibrary, data: str, seed: int) -> Callable[[int], Lesson | None]:
     return partial(lesson_of, weights, shapes, data, seed)
-
-
-def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: int) -> Lesson | None:
-    """Make pair ``number`` and solve it; None where nothing follows, or single points decide.
-
-    Raises:
-        InputError: no such pair can be made of the shapes.
-    """
-    rng = np.random.default_rng([seed, number])
-    with made_of(data):
-        kind, protocol, pair, possible = _pair(shapes, seed, number, rng)
-    prepared = prepare(pair.source, pair.target, POINTS, clean=protocol.cleans)
-    view = predict(load_network(weights, "cpu")[0], prepared, 0)
-    problem = problem_of(prepared, view)
-    prior = Prior(prepared.normalise(pair.gt_T_target_source)) if possible else ANYWHERE
-    try:
-        estimate = solve(problem, prior=prior)
-    except ValueError:
-        return None
-    if estimate.shared_points:
-        return None
-    candidates = (estimate.best, *estimate.rivals)
-    shown = close_ups(problem, candidates)
-    return Lesson(
-        kind,
-        str(pair.shape),
-        np.stack([one.points for one in shown]).astype(np.float16),
-        np.stack([one.whole for one in shown]),
-        np.array(
-            [possible and _right(each.T_target_source, pair, protocol, prepared) for each in candidates]
-        ),
-        np.array([each.origin != "initial" for each in candidates]),
-        np.array([each.standing for each in candidates]),
-    )
-
-
-def _pair(
-    shapes: ShapeLibrary, seed: int, number: int, rng: np.random.Generator
-) -> tuple[str, AnyProtocol, ScanPair, bool]:
-    """Return the kind of pair ``number``, its protocol, the pair, and whether anything puts it right."""
-    shares = np.cumsum([share for share, _ in MIXTURE])
-    protocol = MIXTURE[int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))][1]
-    pair = protocol.pair(shapes, seed, number)
-    draw = rng.random()
-    if draw < DIFFERENT:
-        other = protocol.pair(shapes, seed + OTHERS, number)
-        return "different", protocol, replace(pair, target=other.target), False
-    if draw < DIFFERENT + MIRRORED:
-        mirror = np.ones(3)
-        mirror[rng.integers(3)] = -1.0
-        return "mirrored", protocol, replace(pair, source=PointCloud(pair.source.points * mirror)), False
-    return protocol.name, protocol, pair, True
-
-
-def _right(T: np.ndarray, pair: ScanPair, protocol: AnyProtocol, prepared: PreparedPair) -> bool:
-    return measure_pose(
-        prepared.denormalise(T),
-        pair.gt_T_target_source,
-        protocol.unit(pair),
-        centre=protocol.centre(pair),
-        object_points=pair.object_points,
-        extent=pair.extent,
-    ).symmetric

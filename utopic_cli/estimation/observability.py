@@ -123,7 +123,7 @@ def stiffness(
     target: Surface,
     transformation: np.ndarray,
     twists: Twists | None,
-    likeness: float,
+    agreement: float,
     alike: float,
 ) -> float:
     """Tell how much worse two surfaces agree once the source is moved by ``DISPLACED`` of their size.
@@ -136,12 +136,13 @@ def stiffness(
         target: the scan that stays.
         transformation: (4, 4) T_target_source.
         twists: ``find_twists`` of the three.
-        likeness: of ``meet`` under it.
+        agreement: of ``meet`` under it.
         alike: ``self_agreement`` of the two.
 
     Returns:
-        The least fall of the likeness: 0 or less where a displaced source fits as well, and where too
-        little overlaps to tell.
+        The least fall of the agreement, in units of ``alike``: 0 or less where a displaced source fits as
+        well, and where too little overlaps to tell. The likeness would not do: it is cut off where rough
+        scans agree better with each other than with themselves, and cut off it does not fall.
     """
     if twists is None:
         return 0.0
@@ -154,8 +155,8 @@ def stiffness(
             return 0.0
         for amount in (DISPLACED * extent / speed, -DISPLACED * extent / speed):
             displaced = _screw(amount * omega, amount * (shift - np.cross(omega, twists.centre)))
-            falls.append(likeness - meet(source, target, displaced @ transformation, alike).likeness)
-    return float(min(falls))
+            falls.append(agreement - meet(source, target, displaced @ transformation, alike).agreement)
+    return float(min(falls) / alike)
 
 
 def _screw(omega: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -1,0 +1,178 @@
+"""Lessons for a verifier: simulated pairs, and what the poses that the solve proposes for them look like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from utopic_cli.benchmark.held_out import made_of
+from utopic_cli.benchmark.pair_metrics import measure_pose
+from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
+from utopic_cli.benchmark.trials import trial
+from utopic_cli.bridge import load_network, predict
+from utopic_cli.estimation.close_up import close_ups
+from utopic_cli.estimation.prior import ANYWHERE, Prior
+from utopic_cli.estimation.solver import solve
+from utopic_cli.look import problem_of
+from utopic_cli.point_cloud import PointCloud
+from utopic_cli.preprocess import prepare
+from utopic_cli.synthesis.scan_pair import ScanPair
+from utopic_cli.synthesis.settings import PairSettings
+from utopic_cli.synthesis.shapes import ShapeLibrary
+
+MIXTURE: tuple[tuple[float, AnyProtocol], ...] = (
+    (0.17, CropProtocol("keep 0.7", 0.7, "independent", "uniform")),
+    (0.15, CropProtocol("keep 0.5", 0.5, "independent", "uniform")),
+    (0.18, RangeProtocol(bands=((0.1, 0.3),), name="overlap 0.1-0.3")),
+    (0.10, RangeProtocol(bands=((0.3, 0.5),), name="overlap 0.3-0.5")),
+    (0.03, RangeProtocol(bands=((0.5, 0.9),), name="overlap 0.5-0.9")),
+    (
+        0.10,
+        RangeProtocol(
+            ((0.15, 0.6),), replace(PairSettings(), several_views_probability=1.0), "several views"
+        ),
+    ),
+)
+"""What the pairs are, with their shares; the rest are ``TRIALS``."""
+
+TRIALS = ("scans", "patch", "sparse", "room", "near-symmetric", "little", "disjoint", "different", "mirrored")
+"""Kinds of trials among the lessons: rougher scans, and what is no scan of a shape. Not those where nothing
+tells a right pose from a wrong one."""
+
+DIFFERENT, MIRRORED = 0.10, 0.05
+"""Shares of the other pairs that nothing puts right: scans of two shapes, and of a shape and its mirror
+image."""
+
+OTHERS = 1_000_000
+"""Added to the seed for the second shape."""
+
+POINTS = 1024
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """The candidates of one pair.
+
+    Attributes:
+        kind: of the pair.
+        shape: what was scanned.
+        points: (C, P, F) float16, of each candidate's close-up.
+        whole: (C, G) float32.
+        right: (C,) whether it is right, or as good by symmetry.
+        proposed: (C,) whether the solve came upon it; False for the known answer itself.
+        by_surfaces: (C,) its standing by the surfaces alone.
+    """
+
+    kind: str
+    shape: str
+    points: np.ndarray
+    whole: np.ndarray
+    right: np.ndarray
+    proposed: np.ndarray
+    by_surfaces: np.ndarray
+
+
+@dataclass(frozen=True)
+class Question:
+    """A pair to solve.
+
+    Attributes:
+        kind: of the pair.
+        shape: what was scanned.
+        source: the scan that moves.
+        target: the scan that stays.
+        answer: (4, 4) T_target_source; None where nothing puts the pair right.
+        right: tells whether a (4, 4) answer is right, or as good by symmetry.
+        scans: whether scattered points are left out first, as of scans.
+    """
+
+    kind: str
+    shape: str
+    source: PointCloud
+    target: PointCloud
+    answer: np.ndarray | None
+    right: Callable[[np.ndarray], bool]
+    scans: bool
+
+
+def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: int) -> Lesson | None:
+    """Make pair ``number`` and solve it; None where nothing follows, or single points decide.
+
+    Args:
+        weights: as of ``load_network``.
+        shapes: to make pairs of.
+        data: what to call them.
+        seed: names the set of pairs.
+        number: from 0.
+
+    Raises:
+        InputError: no such pair can be made of the shapes.
+    """
+    with made_of(data):
+        question = question_of(shapes, seed, number)
+    prepared = prepare(question.source, question.target, POINTS, clean=question.scans)
+    view = predict(load_network(weights, "cpu")[0], prepared, 0)
+    problem = problem_of(prepared, view)
+    prior = ANYWHERE if question.answer is None else Prior(prepared.normalise(question.answer))
+    try:
+        estimate = solve(problem, prior=prior)
+    except ValueError:
+        return None
+    if estimate.shared_points:
+        return None
+    candidates = (estimate.best, *estimate.rivals)
+    shown = close_ups(problem, candidates)
+    return Lesson(
+        question.kind,
+        question.shape,
+        np.stack([one.points for one in shown]).astype(np.float16),
+        np.stack([one.whole for one in shown]),
+        np.array([question.right(prepared.denormalise(each.T_target_source)) for each in candidates]),
+        np.array([each.origin != "initial" for each in candidates]),
+        np.array([each.standing for each in candidates]),
+    )
+
+
+def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question:
+    """Make pair ``number``; it depends on the arguments alone.
+
+    Raises:
+        DegeneratePair: no such pair can be made of the shapes.
+    """
+    rng = np.random.default_rng([seed, number])
+    place = int(np.searchsorted(np.cumsum([share for share, _ in MIXTURE]), rng.random(), side="right"))
+    if place == len(MIXTURE):
+        one = trial(shapes, seed, number, TRIALS)
+        return Question(
+            one.kind, one.shape, one.source, one.target, one.gt_T_target_source, one.right, scans=True
+        )
+    protocol = MIXTURE[place][1]
+    pair = protocol.pair(shapes, seed, number)
+    draw = rng.random()
+    if draw < DIFFERENT:
+        other = protocol.pair(shapes, seed + OTHERS, number)
+        return _hopeless("different", protocol, replace(pair, target=other.target))
+    if draw < DIFFERENT + MIRRORED:
+        mirror = np.ones(3)
+        mirror[rng.integers(3)] = -1.0
+        return _hopeless("mirrored", protocol, replace(pair, source=PointCloud(pair.source.points * mirror)))
+
+    def right(T: np.ndarray) -> bool:
+        return measure_pose(
+            T,
+            pair.gt_T_target_source,
+            protocol.unit(pair),
+            centre=protocol.centre(pair),
+            object_points=pair.object_points,
+            extent=pair.extent,
+        ).symmetric
+
+    shape, answer = str(pair.shape), pair.gt_T_target_source
+    return Question(protocol.name, shape, pair.source, pair.target, answer, right, protocol.cleans)
+
+
+def _hopeless(kind: str, protocol: AnyProtocol, pair: ScanPair) -> Question:
+    shape = str(pair.shape)
+    return Question(kind, shape, pair.source, pair.target, None, lambda T: False, protocol.cleans)
