@@ -6,6 +6,7 @@ import torch
 from tests.model.conftest import SMALL, bumpy_points
 from utopic_cli.bridge import Eye, predict
 from utopic_cli.config import ModelConfig
+from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import prepare
@@ -25,3 +26,23 @@ def test_looking_again_finds_a_cloud_once_and_sees_the_same(monkeypatch) -> None
         for name, values in vars(plain).items():
             np.testing.assert_array_equal(getattr(view, name), values)
     assert len(encoded) == 2
+
+
+def test_overlap_is_no_surer_than_the_pose_it_rests_on() -> None:
+    torch.manual_seed(0)
+    model = Utopic(ModelConfig(**SMALL)).eval()
+    pair = prepare(*(PointCloud(bumpy_points(400, seed)) for seed in (0, 1)), 120)
+    untaught = predict(model, pair, 3, np.eye(4), 2.0)
+    model.verifier = PoseVerifier(3, 2, 4)
+    plain = predict(model, pair, 3, np.eye(4))
+    np.testing.assert_array_equal(untaught.source_overlap, plain.source_overlap)
+
+    model.verifier.reading.copy_(torch.tensor([1.5, -0.5]))
+    np.testing.assert_array_equal(predict(model, pair, 3, np.eye(4)).source_overlap, plain.source_overlap)
+    odds = np.log(plain.source_overlap / (1.0 - plain.source_overlap))
+    for plausibility, doubt in ((4.0, 0.0), (0.0, 0.0), (-3.0, -3.0)):
+        read = predict(model, pair, 3, np.eye(4), plausibility)
+        expected = 1.0 / (1.0 + np.exp(-(1.5 * odds - 0.5 + doubt)))
+        np.testing.assert_allclose(read.source_overlap, expected, atol=1e-5)
+        np.testing.assert_array_equal(read.source_raw, plain.source_raw)
+    assert read.target_overlap.mean() < 0.2 * plain.target_overlap.mean()

@@ -85,7 +85,9 @@ class Eye:
         self.seed = seed
         self._seen: list[tuple[SampledCloud, CloudInput, EncodedCloud]] = []
 
-    def __call__(self, prepared: PreparedPair, hypothesis: np.ndarray | None = None) -> NetworkView:
+    def __call__(
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+    ) -> NetworkView:
         """Look at a prepared pair; see ``predict``."""
         device = next(self.model.parameters()).device
         with torch.inference_mode():
@@ -100,7 +102,7 @@ class Eye:
                 else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
                 encoded=(encoded_source, encoded_target),
             )
-        return _as_view(prediction, self.model)
+        return _as_view(prediction, self.model, plausibility)
 
     def _encode(self, cloud: SampledCloud, spacing: float) -> tuple[CloudInput, EncodedCloud]:
         for known, given, encoded in self._seen:
@@ -114,7 +116,11 @@ class Eye:
 
 
 def predict(
-    model: Utopic, prepared: PreparedPair, seed: int, hypothesis: np.ndarray | None = None
+    model: Utopic,
+    prepared: PreparedPair,
+    seed: int,
+    hypothesis: np.ndarray | None = None,
+    plausibility: float | None = None,
 ) -> NetworkView:
     """Run the network on a prepared pair, on the device its weights are on.
 
@@ -123,8 +129,9 @@ def predict(
         prepared: the pair.
         seed: seed of the overlap samples.
         hypothesis: (4, 4) transformation between the normalised clouds to judge the points by.
+        plausibility: log-odds that it is right; None: overlap stays as the network gives it.
     """
-    return Eye(model, seed)(prepared, hypothesis)
+    return Eye(model, seed)(prepared, hypothesis, plausibility)
 
 
 def verify(verifier: PoseVerifier, shown: Sequence[CloseUp]) -> np.ndarray:
@@ -136,8 +143,13 @@ def verify(verifier: PoseVerifier, shown: Sequence[CloseUp]) -> np.ndarray:
         return verifier(points, whole).cpu().numpy().astype(np.float64)
 
 
-def _as_view(prediction: Prediction, model: Utopic) -> NetworkView:
+def _as_view(prediction: Prediction, model: Utopic, plausibility: float | None) -> NetworkView:
     source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
+    if model.verifier is not None and plausibility is not None:
+        source_overlap, target_overlap = (
+            torch.sigmoid(model.verifier.read(logits, plausibility))
+            for logits in (prediction.source_overlap_logits, prediction.target_overlap_logits)
+        )
     if not model.config.overlap:  # the variant without O weighs all correspondences alike
         source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
     return NetworkView(

@@ -157,7 +157,7 @@ def _register(
     normalised = prepared.normalise(transformation)
     if model.config.hypothesis and options.solver != "svd":
         clock.start("look again")
-        view = see(prepared, normalised)
+        view = see(prepared, normalised, estimate.best.plausibility)
     clock.start("measure")
     spacings = [
         point_spacing(cloud.points, tree) for cloud, tree in zip((source, target), trees, strict=True)

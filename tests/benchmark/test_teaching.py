@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from utopic_cli.benchmark.lessons import TRIALS, Lesson, Question, lesson_of, question_of
-from utopic_cli.benchmark.teaching import FEWEST, fit, learn, plausible
+from utopic_cli.benchmark.teaching import FEWEST, fit, learn, plausible, reading_of
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
 from utopic_cli.geometry import rigid
@@ -21,8 +24,18 @@ def made_up(number: int, tell: float = 1.5) -> Lesson:
     points[right, :, 3] += tell
     whole = rng.standard_normal((4, WHOLE_FEATURES)).astype(np.float32)
     proposed = np.array([True, True, True, number % 5 > 0])
+    # Logits that are too high by two and half as large as they ought to be.
+    odds = rng.normal(0.0, 2.0, 100)
     return Lesson(
-        "scans", f"shape {number}", points.astype(np.float16), whole, right, proposed, rng.standard_normal(4)
+        "scans",
+        f"shape {number}",
+        points.astype(np.float16),
+        whole,
+        right,
+        proposed,
+        rng.standard_normal(4),
+        odds / 2.0 + 2.0,
+        rng.random(100) < 1.0 / (1.0 + np.exp(-odds)),
     )
 
 
@@ -60,6 +73,20 @@ def test_it_is_measured_on_shapes_left_out(lessons):
     assert len(told) == 4
 
 
+def test_overlap_is_read_as_it_turned_out(lessons):
+    slope, shift = reading_of(lessons)
+    assert abs(slope - 2.0) < 0.25 and abs(shift + 4.0) < 0.5
+    verifier, described = learn(lessons, {}, 0)
+    assert np.allclose(verifier.reading.numpy(), [slope, shift])
+    told = described["overlap"]
+    assert told["points"] == 6000 and told["accuracy"] > told["accuracy_as_it_is"] + 0.1
+    logits = torch.tensor([[2.0, 4.0]])
+    assert torch.allclose(verifier.read(logits, 3.0), verifier.read(logits, 0.0))
+    assert torch.allclose(verifier.read(logits, -3.0), verifier.read(logits, 0.0) - 3.0)
+    alone = [replace(lesson, overlaps=np.ones(100, bool)) for lesson in lessons]
+    assert reading_of(alone).tolist() == [1.0, 0.0]
+
+
 def test_too_few_lessons_are_refused(lessons):
     with pytest.raises(InputError, match=f"{FEWEST} are needed"):
         learn(lessons[: FEWEST - 1], {}, 0)
@@ -68,7 +95,7 @@ def test_too_few_lessons_are_refused(lessons):
 @pytest.fixture(scope="module")
 def questions() -> list[Question]:
     shapes = open_shapes("procedural").select("train")
-    return [question_of(shapes, 3, number) for number in range(40)]
+    return [question_of(shapes, 3, number) for number in range(26)]
 
 
 def test_pairs_are_of_many_kinds_and_made_again_alike(questions):
@@ -104,5 +131,9 @@ def test_a_lesson_holds_the_known_answer_and_what_the_solve_proposed():
         assert lesson.points.shape[2] == POINT_FEATURES and np.isfinite(lesson.points).all()
         if lesson.kind in ("different", "mirrored"):
             assert not lesson.right.any() and lesson.proposed.all()
+    first = lessons[0]
+    assert len(first.overlap) == len(first.overlaps) > 400 and first.overlaps.any()
+    assert ((first.overlap > 0) == first.overlaps).mean() > 0.7
+    assert not any(len(lesson.overlap) for lesson in lessons[1:])
     assert any(lesson.right.any() and not lesson.right.all() for lesson in lessons)
     assert again is not None and found[1] is not None and np.array_equal(again.points, found[1].points)

@@ -213,7 +213,8 @@ class _Desk:
             again = look.view
             if matcher.looks_again:
                 with _cpu(seconds, "look_again"):
-                    again = matcher.look(look.prepared, look.prepared.normalise(T))
+                    normalised = look.prepared.normalise(T)
+                    again = matcher.look(look.prepared, normalised, look.estimate.best.plausibility)
             for name, view in (("first", look.view), ("final", again)):
                 told[f"{name}_overlap"] = measure_overlap(view, self._known)
                 told[f"{name}_uncertainty"] = measure_uncertainty(look.prepared, view, self._known)

@@ -47,8 +47,10 @@ class Fpfh:
             "open3d": load_open3d().__version__,
         }
 
-    def look(self, prepared: PreparedPair, hypothesis: np.ndarray | None = None) -> NetworkView:
-        """Return its view of a prepared pair; ``hypothesis`` changes nothing."""
+    def look(
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+    ) -> NetworkView:
+        """Return its view of a prepared pair; a transformation changes nothing."""
         features = [_node_features(cloud, prepared.spacing) for cloud in (prepared.source, prepared.target)]
         scores = dual_softmax(features[0] @ features[1].T)
         n, m = scores.shape

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from utopic_cli.benchmark.held_out import made_of
-from utopic_cli.benchmark.pair_metrics import measure_pose
-from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
+from utopic_cli.benchmark.pair_metrics import known_nodes, measure_pose
+from utopic_cli.benchmark.protocols import SCAN_REACH, AnyProtocol, CropProtocol, RangeProtocol
 from utopic_cli.benchmark.trials import trial
 from utopic_cli.bridge import load_network, predict
 from utopic_cli.estimation.close_up import close_ups
@@ -17,7 +17,7 @@ from utopic_cli.estimation.prior import ANYWHERE, Prior
 from utopic_cli.estimation.solver import solve
 from utopic_cli.look import problem_of
 from utopic_cli.point_cloud import PointCloud
-from utopic_cli.preprocess import prepare
+from utopic_cli.preprocess import PreparedPair, prepare
 from utopic_cli.synthesis.scan_pair import ScanPair
 from utopic_cli.synthesis.settings import PairSettings
 from utopic_cli.synthesis.shapes import ShapeLibrary
@@ -49,6 +49,7 @@ OTHERS = 1_000_000
 """Added to the seed for the second shape."""
 
 POINTS = 1024
+OVERLAP_EVERY = 4
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,9 @@ class Lesson:
         right: (C,) whether it is right, or as good by symmetry.
         proposed: (C,) whether the solve came upon it; False for the known answer itself.
         by_surfaces: (C,) its standing by the surfaces alone.
+        overlap: (N,) what the network makes of its points when shown a right one of them, as logits; of
+            every fourth pair, else empty.
+        overlaps: (N,) whether they overlap.
     """
 
     kind: str
@@ -72,6 +76,8 @@ class Lesson:
     right: np.ndarray
     proposed: np.ndarray
     by_surfaces: np.ndarray
+    overlap: np.ndarray
+    overlaps: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -86,6 +92,7 @@ class Question:
         answer: (4, 4) T_target_source; None where nothing puts the pair right.
         right: tells whether a (4, 4) answer is right, or as good by symmetry.
         scans: whether scattered points are left out first, as of scans.
+        radius: called with the prepared pair: points nearer than this overlap, normalised units.
     """
 
     kind: str
@@ -95,6 +102,7 @@ class Question:
     answer: np.ndarray | None
     right: Callable[[np.ndarray], bool]
     scans: bool
+    radius: Callable[[PreparedPair], float]
 
 
 def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: int) -> Lesson | None:
@@ -113,7 +121,8 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
     with made_of(data):
         question = question_of(shapes, seed, number)
     prepared = prepare(question.source, question.target, POINTS, clean=question.scans)
-    view = predict(load_network(weights, "cpu")[0], prepared, 0)
+    model = load_network(weights, "cpu")[0]
+    view = predict(model, prepared, 0)
     problem = problem_of(prepared, view)
     prior = ANYWHERE if question.answer is None else Prior(prepared.normalise(question.answer))
     try:
@@ -124,15 +133,29 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
         return None
     candidates = (estimate.best, *estimate.rivals)
     shown = close_ups(problem, candidates)
+    right = np.array([question.right(prepared.denormalise(each.T_target_source)) for each in candidates])
+    overlap, overlaps = np.zeros(0), np.zeros(0, bool)
+    if number % OVERLAP_EVERY == 0 and right.any() and question.answer is not None:
+        again = predict(model, prepared, 0, candidates[int(right.argmax())].T_target_source)
+        known = known_nodes(prepared, question.answer, question.radius(prepared))
+        overlap = _logit(np.concatenate([again.source_overlap, again.target_overlap]))
+        overlaps = np.concatenate([known.source_overlap, known.target_overlap])
     return Lesson(
         question.kind,
         question.shape,
         np.stack([one.points for one in shown]).astype(np.float16),
         np.stack([one.whole for one in shown]),
-        np.array([question.right(prepared.denormalise(each.T_target_source)) for each in candidates]),
+        right,
         np.array([each.origin != "initial" for each in candidates]),
         np.array([each.standing for each in candidates]),
+        overlap.astype(np.float32),
+        overlaps,
     )
+
+
+def _logit(probability: np.ndarray) -> np.ndarray:
+    probability = np.clip(probability, 1e-4, 1.0 - 1e-4)
+    return np.log(probability / (1.0 - probability))
 
 
 def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question:
@@ -146,7 +169,7 @@ def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question:
     if place == len(MIXTURE):
         one = trial(shapes, seed, number, TRIALS)
         return Question(
-            one.kind, one.shape, one.source, one.target, one.gt_T_target_source, one.right, scans=True
+            one.kind, one.shape, one.source, one.target, one.gt_T_target_source, one.right, True, _scan_radius
         )
     protocol = MIXTURE[place][1]
     pair = protocol.pair(shapes, seed, number)
@@ -170,9 +193,31 @@ def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question:
         ).symmetric
 
     shape, answer = str(pair.shape), pair.gt_T_target_source
-    return Question(protocol.name, shape, pair.source, pair.target, answer, right, protocol.cleans)
+    return Question(
+        protocol.name,
+        shape,
+        pair.source,
+        pair.target,
+        answer,
+        right,
+        protocol.cleans,
+        protocol.overlap_radius,
+    )
 
 
 def _hopeless(kind: str, protocol: AnyProtocol, pair: ScanPair) -> Question:
     shape = str(pair.shape)
-    return Question(kind, shape, pair.source, pair.target, None, lambda T: False, protocol.cleans)
+    return Question(
+        kind,
+        shape,
+        pair.source,
+        pair.target,
+        None,
+        lambda T: False,
+        protocol.cleans,
+        protocol.overlap_radius,
+    )
+
+
+def _scan_radius(prepared: PreparedPair) -> float:
+    return SCAN_REACH * prepared.spacing

@@ -40,8 +40,16 @@ class Matcher(Protocol):
         """Return everything needed to repeat it, JSON-ready."""
         ...
 
-    def look(self, prepared: PreparedPair, hypothesis: np.ndarray | None = None) -> NetworkView:
-        """Say what it sees, shown a (4, 4) transformation of the normalised clouds or none."""
+    def look(
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+    ) -> NetworkView:
+        """Say what it sees, shown a (4, 4) transformation of the normalised clouds or none.
+
+        Args:
+            prepared: the pair.
+            hypothesis: the transformation.
+            plausibility: log-odds that it is right; None: overlap stays as the network gives it.
+        """
         ...
 
 
@@ -77,9 +85,11 @@ class Network:
             "device": str(next(self.model.parameters()).device),
         }
 
-    def look(self, prepared: PreparedPair, hypothesis: np.ndarray | None = None) -> NetworkView:
+    def look(
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+    ) -> NetworkView:
         """Run the network."""
-        return predict(self.model, prepared, self.seed, hypothesis)
+        return predict(self.model, prepared, self.seed, hypothesis, plausibility)
 
 
 def load_matchers(

@@ -19,6 +19,7 @@ from utopic_cli.benchmark.lessons import Lesson, lesson_of
 from utopic_cli.benchmark.pool import each
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
+from utopic_cli.estimation.confidence import fit_calibration
 from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
@@ -112,7 +113,9 @@ def learn(
         "epochs": EPOCHS,
         "out_of_fold": _chosen(held),
     }
-    return fit(lessons, seed), description
+    verifier = fit(lessons, seed)
+    verifier.reading.copy_(torch.from_numpy(reading_of(lessons)))
+    return verifier, {**description, "overlap": _told(verifier, lessons)}
 
 
 def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
@@ -148,6 +151,32 @@ def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
                 optimiser.step()
                 schedule.step()
     return verifier.eval()
+
+
+def reading_of(lessons: Sequence[Lesson]) -> np.ndarray:
+    """Fit the slope and shift (2,) that turn the overlap logits of right poses into log-odds.
+
+    They are 1 and 0 where the lessons show no overlap, or nothing else.
+    """
+    logits = np.concatenate([lesson.overlap for lesson in lessons])
+    overlaps = np.concatenate([lesson.overlaps for lesson in lessons])
+    if not overlaps.any() or overlaps.all():
+        return np.array([1.0, 0.0])
+    model = fit_calibration(("logit",), logits[:, None].astype(np.float64), overlaps, threshold=0.5)
+    slope = model.coefficients[0] / model.deviation[0]
+    return np.array([slope, model.intercept - slope * model.mean[0]])
+
+
+def _told(verifier: PoseVerifier, lessons: Sequence[Lesson]) -> dict[str, float]:
+    """Describe how overlap is read, and the share of points told right before and after."""
+    logits = np.concatenate([lesson.overlap for lesson in lessons])
+    overlaps = np.concatenate([lesson.overlaps for lesson in lessons])
+    slope, shift = verifier.reading.tolist()
+    counted = {"slope": slope, "shift": shift, "points": len(logits)}
+    if len(logits):
+        counted["accuracy_as_it_is"] = float(((logits > 0) == overlaps).mean())
+        counted["accuracy"] = float(((slope * logits + shift > 0) == overlaps).mean())
+    return counted
 
 
 def plausible(verifier: PoseVerifier, lesson: Lesson) -> np.ndarray:

@@ -3,6 +3,7 @@
 Not in the paper. Matches propose several poses, and averages over the surfaces choose among them badly
 where a half turn fits nearly as well. This small set network (in the manner of PointNet: the same layers for
 every point, then pooling) learned on right and wrong poses that the solve had proposed for simulated pairs.
+With it comes how to read the overlap that the network gives when it is shown a pose.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ class PoseVerifier(nn.Module):
 
     Attributes:
         sizes: the arguments that it was built with.
+        reading: (2,) slope and shift that turn the network's overlap logits, shown a right pose, into
+            log-odds.
     """
 
     point_mean: Tensor
     point_scale: Tensor
     whole_mean: Tensor
     whole_scale: Tensor
+    reading: Tensor
 
     def __init__(self, point_features: int, whole_features: int, width: int) -> None:
         """Build with random weights.
@@ -43,6 +47,7 @@ class PoseVerifier(nn.Module):
         for name, count in (("point", point_features), ("whole", whole_features)):
             self.register_buffer(f"{name}_mean", torch.zeros(count))
             self.register_buffer(f"{name}_scale", torch.ones(count))
+        self.register_buffer("reading", torch.tensor([1.0, 0.0]))
         self.points = nn.Sequential(
             nn.Linear(point_features, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
         )
@@ -61,6 +66,17 @@ class PoseVerifier(nn.Module):
             flat = values.reshape(-1, values.shape[-1]).float()
             getattr(self, f"{name}_mean").copy_(flat.mean(dim=0))
             getattr(self, f"{name}_scale").copy_(flat.std(dim=0) + 1e-3)
+
+    def read(self, overlap_logits: Tensor, plausibility: float) -> Tensor:
+        """Return log-odds of overlap, of the same shape, where the network was shown a pose.
+
+        What it then sees rests on the pose, so nothing overlaps more surely than that is right.
+
+        Args:
+            overlap_logits: the network's.
+            plausibility: log-odds that the pose is right.
+        """
+        return self.reading[0] * overlap_logits + self.reading[1] + min(plausibility, 0.0)
 
     @one_thread()
     def forward(self, points: Tensor, whole: Tensor) -> Tensor:
