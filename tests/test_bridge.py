@@ -37,12 +37,12 @@ def test_overlap_is_no_surer_than_the_pose_it_rests_on() -> None:
     plain = predict(model, pair, 3, np.eye(4))
     np.testing.assert_array_equal(untaught.source_overlap, plain.source_overlap)
 
-    model.verifier.reading.copy_(torch.tensor([1.5, -0.5]))
+    model.verifier.reading.copy_(torch.tensor([1.5, -0.5, 0.25]))
     np.testing.assert_array_equal(predict(model, pair, 3, np.eye(4)).source_overlap, plain.source_overlap)
     odds = np.log(plain.source_overlap / (1.0 - plain.source_overlap))
-    for plausibility, doubt in ((4.0, 0.0), (0.0, 0.0), (-3.0, -3.0)):
+    for plausibility, right in ((30.0, 1.0), (0.0, 0.5), (-np.log(3.0), 0.25), (-30.0, 0.0)):
         read = predict(model, pair, 3, np.eye(4), plausibility)
-        expected = 1.0 / (1.0 + np.exp(-(1.5 * odds - 0.5 + doubt)))
+        expected = right / (1.0 + np.exp(-(1.5 * odds - 0.5))) + (1.0 - right) * 0.25
         np.testing.assert_allclose(read.source_overlap, expected, atol=1e-5)
         np.testing.assert_array_equal(read.source_raw, plain.source_raw)
-    assert read.target_overlap.mean() < 0.2 * plain.target_overlap.mean()
+    np.testing.assert_allclose(read.target_overlap, 0.25, atol=1e-5)

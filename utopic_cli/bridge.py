@@ -147,7 +147,7 @@ def _as_view(prediction: Prediction, model: Utopic, plausibility: float | None) 
     source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
     if model.verifier is not None and plausibility is not None:
         source_overlap, target_overlap = (
-            torch.sigmoid(model.verifier.read(logits, plausibility))
+            model.verifier.read(logits, plausibility)
             for logits in (prediction.source_overlap_logits, prediction.target_overlap_logits)
         )
     if not model.config.overlap:  # the variant without O weighs all correspondences alike

@@ -64,9 +64,9 @@ class Lesson:
         right: (C,) whether it is right, or as good by symmetry.
         proposed: (C,) whether the solve came upon it; False for the known answer itself.
         by_surfaces: (C,) its standing by the surfaces alone.
-        overlap: (N,) what the network makes of its points when shown a right one of them, as logits; of
-            every fourth pair, else empty.
-        overlaps: (N,) whether they overlap.
+        overlap: (N,) what the network makes of the pair's points when shown a right pose that was proposed,
+            as logits; empty without one, and but for every fourth pair.
+        overlaps: (N,) whether they overlap; empty but for every fourth pair.
     """
 
     kind: str
@@ -134,23 +134,33 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
     candidates = (estimate.best, *estimate.rivals)
     shown = close_ups(problem, candidates)
     right = np.array([question.right(prepared.denormalise(each.T_target_source)) for each in candidates])
+    proposed = np.array([each.origin != "initial" for each in candidates])
     overlap, overlaps = np.zeros(0), np.zeros(0, bool)
-    if number % OVERLAP_EVERY == 0 and right.any() and question.answer is not None:
-        again = predict(model, prepared, 0, candidates[int(right.argmax())].T_target_source)
-        known = known_nodes(prepared, question.answer, question.radius(prepared))
-        overlap = _logit(np.concatenate([again.source_overlap, again.target_overlap]))
-        overlaps = np.concatenate([known.source_overlap, known.target_overlap])
+    if number % OVERLAP_EVERY == 0:
+        overlaps = _overlaps(prepared, question)
+        if (right & proposed).any():
+            best = candidates[int((right & proposed).argmax())]
+            again = predict(model, prepared, 0, best.T_target_source)
+            overlap = _logit(np.concatenate([again.source_overlap, again.target_overlap]))
     return Lesson(
         question.kind,
         question.shape,
         np.stack([one.points for one in shown]).astype(np.float16),
         np.stack([one.whole for one in shown]),
         right,
-        np.array([each.origin != "initial" for each in candidates]),
+        proposed,
         np.array([each.standing for each in candidates]),
         overlap.astype(np.float32),
         overlaps,
     )
+
+
+def _overlaps(prepared: PreparedPair, question: Question) -> np.ndarray:
+    """Tell which sampled points of both scans overlap (N,): none, where nothing puts the pair right."""
+    if question.answer is None:
+        return np.zeros(len(prepared.source.points) + len(prepared.target.points), bool)
+    known = known_nodes(prepared, question.answer, question.radius(prepared))
+    return np.concatenate([known.source_overlap, known.target_overlap])
 
 
 def _logit(probability: np.ndarray) -> np.ndarray:

@@ -154,25 +154,33 @@ def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
 
 
 def reading_of(lessons: Sequence[Lesson]) -> np.ndarray:
-    """Fit the slope and shift (2,) that turn the overlap logits of right poses into log-odds.
+    """Fit how to read overlap (3,); see ``PoseVerifier``.
 
-    They are 1 and 0 where the lessons show no overlap, or nothing else.
+    Slope and shift are 1 and 0 where right poses show no overlap, or nothing else.
     """
-    logits = np.concatenate([lesson.overlap for lesson in lessons])
-    overlaps = np.concatenate([lesson.overlaps for lesson in lessons])
+    without = [lesson.overlaps.mean() for lesson in lessons if len(lesson.overlaps) > len(lesson.overlap)]
+    usual = float(np.mean(without)) if without else 0.0
+    logits, overlaps = _shown(lessons)
     if not overlaps.any() or overlaps.all():
-        return np.array([1.0, 0.0])
+        return np.array([1.0, 0.0, usual])
     model = fit_calibration(("logit",), logits[:, None].astype(np.float64), overlaps, threshold=0.5)
     slope = model.coefficients[0] / model.deviation[0]
-    return np.array([slope, model.intercept - slope * model.mean[0]])
+    return np.array([slope, model.intercept - slope * model.mean[0], usual])
+
+
+def _shown(lessons: Sequence[Lesson]) -> tuple[np.ndarray, np.ndarray]:
+    """Overlap logits (N,) of all lessons in which the network was shown a right pose, and what is true."""
+    shown = [lesson for lesson in lessons if len(lesson.overlap)]
+    if not shown:
+        return np.zeros(0), np.zeros(0, bool)
+    return np.concatenate([one.overlap for one in shown]), np.concatenate([one.overlaps for one in shown])
 
 
 def _told(verifier: PoseVerifier, lessons: Sequence[Lesson]) -> dict[str, float]:
     """Describe how overlap is read, and the share of points told right before and after."""
-    logits = np.concatenate([lesson.overlap for lesson in lessons])
-    overlaps = np.concatenate([lesson.overlaps for lesson in lessons])
-    slope, shift = verifier.reading.tolist()
-    counted = {"slope": slope, "shift": shift, "points": len(logits)}
+    logits, overlaps = _shown(lessons)
+    slope, shift, usual = verifier.reading.tolist()
+    counted = {"slope": slope, "shift": shift, "usual_without_a_right_pose": usual, "points": len(logits)}
     if len(logits):
         counted["accuracy_as_it_is"] = float(((logits > 0) == overlaps).mean())
         counted["accuracy"] = float(((slope * logits + shift > 0) == overlaps).mean())

@@ -8,6 +8,8 @@ With it comes how to read the overlap that the network gives when it is shown a 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -24,8 +26,8 @@ class PoseVerifier(nn.Module):
 
     Attributes:
         sizes: the arguments that it was built with.
-        reading: (2,) slope and shift that turn the network's overlap logits, shown a right pose, into
-            log-odds.
+        reading: (3,) how to read overlap: slope and shift that turn the network's logits, shown a right
+            pose, into log-odds, and the share that overlaps where no right pose was found.
     """
 
     point_mean: Tensor
@@ -47,7 +49,7 @@ class PoseVerifier(nn.Module):
         for name, count in (("point", point_features), ("whole", whole_features)):
             self.register_buffer(f"{name}_mean", torch.zeros(count))
             self.register_buffer(f"{name}_scale", torch.ones(count))
-        self.register_buffer("reading", torch.tensor([1.0, 0.0]))
+        self.register_buffer("reading", torch.tensor([1.0, 0.0, 0.0]))
         self.points = nn.Sequential(
             nn.Linear(point_features, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
         )
@@ -68,15 +70,17 @@ class PoseVerifier(nn.Module):
             getattr(self, f"{name}_scale").copy_(flat.std(dim=0) + 1e-3)
 
     def read(self, overlap_logits: Tensor, plausibility: float) -> Tensor:
-        """Return log-odds of overlap, of the same shape, where the network was shown a pose.
+        """Return probabilities of overlap, of the same shape, where the network was shown a pose.
 
-        What it then sees rests on the pose, so nothing overlaps more surely than that is right.
+        What it then sees holds if the pose is right; if it is not, nothing is known but what is usual then.
 
         Args:
             overlap_logits: the network's.
             plausibility: log-odds that the pose is right.
         """
-        return self.reading[0] * overlap_logits + self.reading[1] + min(plausibility, 0.0)
+        slope, shift, usual = self.reading
+        right = 1.0 / (1.0 + math.exp(-plausibility))
+        return right * torch.sigmoid(slope * overlap_logits + shift) + (1.0 - right) * usual
 
     @one_thread()
     def forward(self, points: Tensor, whole: Tensor) -> Tensor:
