@@ -40,7 +40,7 @@ else tells a body from its mirror image where most of it is symmetric. Both ways
 place a scan was taken from is a guess: where that is wrong, one way sees much conflict and the other
 hardly any."""
 
-LIMP = 0.0
+LIMP = 0.02
 """A stiffness of no more: displaced by what a right answer may be off by, the source fits as well."""
 
 FEW_EXPLAINED = -1.2

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.estimation.conftest import lumpy_surface
+from utopic_cli.estimation import observability
 from utopic_cli.estimation.meeting import MOST_ALIKE, meet, self_agreement
 from utopic_cli.estimation.observability import find_twists, observe, stiffness
 from utopic_cli.estimation.surface import Surface, make_surface
@@ -128,8 +129,8 @@ def test_surfaces_that_do_not_meet_have_no_answer():
     assert find_twists(cloud, cloud, rigid.rigid(np.eye(3), np.array([50.0, 0, 0]))) is None
 
 
-def felt(source: Surface, target: Surface, T: np.ndarray, agreement: float, alike: float) -> float:
-    return stiffness(source, target, T, find_twists(source, target, T), agreement, alike)
+def felt(source: Surface, target: Surface, T: np.ndarray, alike: float) -> float:
+    return stiffness(source, target, T, find_twists(source, target, T), alike)
 
 
 def stiffness_of(shape, **how) -> float:  # type: ignore[no-untyped-def]
@@ -137,7 +138,7 @@ def stiffness_of(shape, **how) -> float:  # type: ignore[no-untyped-def]
         surface(shape(np.random.default_rng(seed), **how), np.array([9.0, 2.0, 9.0])) for seed in (1, 2)
     )
     alike = self_agreement(source, target)
-    return felt(source, target, np.eye(4), meet(source, target, np.eye(4), alike).agreement, alike)
+    return felt(source, target, np.eye(4), alike)
 
 
 @pytest.mark.parametrize("shape", [plane, cylinder])
@@ -162,18 +163,26 @@ def test_rough_scans_that_agree_better_than_with_themselves_are_stiff_as_well() 
     source, target = (
         surface(profile(np.random.default_rng(seed), notch=0.2), np.array([9.0, 2.0, 9.0])) for seed in (1, 2)
     )
-    met = meet(source, target, np.eye(4), 0.3)
-    assert met.likeness == MOST_ALIKE and meet(source, target, shifted(0.1), 0.3).likeness == MOST_ALIKE
-    assert felt(source, target, np.eye(4), met.agreement, 0.3) > 0.1
+    along = rigid.rigid(np.eye(3), np.array([0.0, 0.1, 0.0]))
+    assert meet(source, target, np.eye(4), 0.3).likeness == MOST_ALIKE
+    assert meet(source, target, along, 0.3).likeness == MOST_ALIKE
+    assert felt(source, target, np.eye(4), 0.3) > 0.1
 
 
-def shifted(along_y: float) -> np.ndarray:
-    return rigid.rigid(np.eye(3), np.array([0.0, along_y, 0.0]))
+def test_points_that_meet_only_once_displaced_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two rough points of four meet, one agrees; displaced, the two flat ones meet as well, and agree."""
+    here = np.array([True, True, False, False]), np.array([True, False, False, False])
+    there = np.array([True, True, True, True]), np.array([False, False, True, True])
+    monkeypatch.setattr(
+        observability, "agreeing", lambda source, target, T: here if np.array_equal(T, np.eye(4)) else there
+    )
+    one = surface(profile(np.random.default_rng(1)), np.array([9.0, 2.0, 9.0]))
+    assert felt(one, one, np.eye(4), 0.5) == 1.0
 
 
 def test_where_nothing_overlaps_nothing_is_stiff() -> None:
     one = surface(plane(np.random.default_rng(1)), np.array([0.0, 0.0, 9.0]))
-    assert felt(one, one, rigid.rigid(np.eye(3), np.array([50.0, 0.0, 0.0])), 0.0, 1.0) == 0.0
+    assert felt(one, one, rigid.rigid(np.eye(3), np.array([50.0, 0.0, 0.0])), 1.0) == 0.0
 
 
 def test_a_line_turns_about_itself_unnoticed() -> None:
@@ -183,4 +192,4 @@ def test_a_line_turns_about_itself_unnoticed() -> None:
     for along in (np.eye(3), rigid.rotation_from_vector(np.array([0.3, 0.5, 0.7]))):
         normals = np.tile(along @ [0.0, 0.0, 1.0], (12, 1))
         one = make_surface(PointCloud(line @ along.T, normals), VOXEL)
-        assert felt(one, one, np.eye(4), 1.0, 1.0) <= 0.0
+        assert felt(one, one, np.eye(4), 1.0) <= 0.0

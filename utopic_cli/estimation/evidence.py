@@ -156,7 +156,7 @@ def collect_evidence(
         support_lead=float(support - np.log10(max(rival_support, LEAST_SUPPORT))),
         explained=float(np.log1p(len(estimate.correspondences))),
         fixed=_smallest_eigenvalue(twists),
-        stiffness=stiffness(source, target, transformation, twists, meeting.agreement, alike),
+        stiffness=stiffness(source, target, transformation, twists, alike),
         seen_overlap=inside,
         seen_contrast=inside - outside,
         uncertainty=float(seen.uncertainty[met].mean() if met.any() else seen.uncertainty.mean()),

@@ -63,11 +63,13 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: fl
     if alike is None:
         alike = self_agreement(source, target)
     forward = _one_way(source, target, transformation)
-    backward = _one_way(target, source, rigid.invert(transformation))
+    back = rigid.invert(transformation)
+    backward = _one_way(target, source, back)
     beside = np.concatenate([forward.beside, backward.beside])
     agree = np.concatenate([forward.agree, backward.agree])
     turning = np.concatenate([forward.turning, backward.turning])
-    violation = (forward.violation + backward.violation) / 2.0
+    seen_through = _violation(source, target, transformation), _violation(target, source, back)
+    violation = (seen_through[0] + seen_through[1]) / 2.0
     share = max((forward.share + backward.share) / 2.0, 0.01)
     agreement = float(agree.mean()) if len(agree) else 0.0
     return Meeting(
@@ -80,8 +82,29 @@ def meet(source: Surface, target: Surface, transformation: np.ndarray, alike: fl
         turning=float(np.median(turning)) if len(turning) else 1.0,
         violation=violation,
         conflict=violation / share,
-        contradiction=min(forward.violation, backward.violation) / share,
+        contradiction=min(seen_through) / share,
     )
+
+
+def agreeing(source: Surface, target: Surface, transformation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tell which points meet the other surface, and which of them lie in it; see ``Meeting``.
+
+    Args:
+        source: the scan that moves.
+        target: the scan that stays.
+        transformation: (4, 4) T_target_source.
+
+    Returns:
+        Twice (P,) bool, of points of the source and then of the target: the same for any transformation.
+    """
+    ways = (
+        _one_way(source, target, transformation),
+        _one_way(target, source, rigid.invert(transformation)),
+    )
+    met = np.concatenate([way.met for way in ways])
+    agree = np.zeros(len(met), dtype=bool)
+    agree[met] = np.concatenate([way.agree for way in ways])
+    return met, agree
 
 
 def self_agreement(source: Surface, target: Surface) -> float:
@@ -117,32 +140,29 @@ def _beside_itself(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Way:
-    """One scan's points on the other's surface; the arrays are of the points that meet it.
+    """One scan's points on the other's surface; the last three arrays are of the points that meet it.
 
     Attributes:
-        points: how many were looked at.
+        met: (P,) bool, of the points looked at, which meet it.
         beside: distance from the nearest point's tangent plane, in voxels.
         turning: 1 - cosine of the angle between the normals.
         agree: whether the point lies in the surface.
-        violation: share of all points that stand where the other scan saw free space.
     """
 
-    points: int
+    met: np.ndarray
     beside: np.ndarray
     turning: np.ndarray
     agree: np.ndarray
-    violation: float
 
     @property
     def share(self) -> float:
         """Share of the points that meet the other surface."""
-        return len(self.beside) / self.points
+        return len(self.beside) / len(self.met)
 
 
 def _one_way(moving: Surface, fixed: Surface, T: np.ndarray) -> _Way:
-    stride = max(1, len(moving.points) // SAMPLES)
-    moved = rigid.apply(T, moving.points[::stride])
-    turned = moving.normals[::stride] @ T[:3, :3].T
+    moved = rigid.apply(T, _looked_at(moving.points))
+    turned = _looked_at(moving.normals) @ T[:3, :3].T
     distance, index = fixed.tree.query(moved, distance_upper_bound=MEETING * fixed.voxel)
     met = np.isfinite(distance)
     index = index[met]
@@ -150,9 +170,18 @@ def _one_way(moving: Surface, fixed: Surface, T: np.ndarray) -> _Way:
     beside = np.abs(np.einsum("nd,nd->n", fixed.points[index] - moved[met], plane)) / fixed.voxel
     cosine = np.einsum("nd,nd->n", turned[met], plane)
     return _Way(
-        points=len(moved),
+        met=met,
         beside=beside,
         turning=1.0 - cosine,
         agree=(beside < CLOSE) & (cosine > AGREEING),
-        violation=float(fixed.sight.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean()),
     )
+
+
+def _violation(moving: Surface, fixed: Surface, T: np.ndarray) -> float:
+    """Share of one scan's points that stand where the other scan saw free space."""
+    moved = rigid.apply(T, _looked_at(moving.points))
+    return float(fixed.sight.in_front(moved, FREE_SPACE_MARGIN * fixed.voxel).mean())
+
+
+def _looked_at(rows: np.ndarray) -> np.ndarray:
+    return rows[:: max(1, len(rows) // SAMPLES)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from utopic_cli.estimation.meeting import meet
+from utopic_cli.estimation.meeting import agreeing
 from utopic_cli.estimation.surface import Surface
 from utopic_cli.geometry import rigid
 from utopic_cli.result import FreeMotion, Observability
@@ -123,30 +123,29 @@ def stiffness(
     target: Surface,
     transformation: np.ndarray,
     twists: Twists | None,
-    agreement: float,
     alike: float,
 ) -> float:
     """Tell how much worse two surfaces agree once the source is moved by ``DISPLACED`` of their size.
 
     The normal matrix goes by infinitely small motions and by normals, which noise tilts; here the source
-    is really moved, both ways along each of the motions that are fixed least.
+    is really moved, both ways along each of the motions that are fixed least. Compared are the points that
+    meet the other surface before and after: which ones meet changes, and flat parts agree better than others.
 
     Args:
         source: the scan that moves.
         target: the scan that stays.
         transformation: (4, 4) T_target_source.
         twists: ``find_twists`` of the three.
-        agreement: of ``meet`` under it.
         alike: ``self_agreement`` of the two.
 
     Returns:
-        The least fall of the agreement, in units of ``alike``: 0 or less where a displaced source fits as
-        well, and where too little overlaps to tell. The likeness would not do: it is cut off where rough
-        scans agree better with each other than with themselves, and cut off it does not fall.
+        The least fall of the share that lies in the other surface, in units of ``alike``: about 0 where a
+        displaced source fits as well, and 0 where too little overlaps to tell.
     """
     if twists is None:
         return 0.0
     extent = max(float(np.linalg.norm(np.ptp(surface.points, axis=0))) for surface in (source, target))
+    met, agree = agreeing(source, target, transformation)
     falls = []
     for twist in twists.vectors.T[:LEAST_FIXED]:
         omega, shift = twist[:3] / twists.radius, twist[3:]
@@ -155,8 +154,11 @@ def stiffness(
             return 0.0
         for amount in (DISPLACED * extent / speed, -DISPLACED * extent / speed):
             displaced = _screw(amount * omega, amount * (shift - np.cross(omega, twists.centre)))
-            falls.append(agreement - meet(source, target, displaced @ transformation, alike).agreement)
-    return float(min(falls) / alike)
+            still_met, still_agree = agreeing(source, target, displaced @ transformation)
+            both = met & still_met
+            if both.any():  # else the displaced scans have parted, which is noticed
+                falls.append(float(agree[both].mean() - still_agree[both].mean()))
+    return min(falls, default=alike) / alike
 
 
 def _screw(omega: np.ndarray, shift: np.ndarray) -> np.ndarray:
