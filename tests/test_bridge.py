@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from tests.model.conftest import SMALL, bumpy_points
-from utopic_cli.bridge import Eye, predict
+from utopic_cli.bridge import Eye, predict, read_overlap
 from utopic_cli.config import ModelConfig
 from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.model.utopic import Utopic
@@ -28,20 +28,19 @@ def test_looking_again_finds_a_cloud_once_and_sees_the_same(monkeypatch) -> None
     assert len(encoded) == 2
 
 
-def test_overlap_is_no_surer_than_the_pose_it_rests_on() -> None:
+def test_overlap_is_weighed_with_the_odds_of_the_pose() -> None:
     torch.manual_seed(0)
     model = Utopic(ModelConfig(**SMALL)).eval()
     pair = prepare(*(PointCloud(bumpy_points(400, seed)) for seed in (0, 1)), 120)
-    untaught = predict(model, pair, 3, np.eye(4), 2.0)
-    model.verifier = PoseVerifier(3, 2, 4)
     plain = predict(model, pair, 3, np.eye(4))
-    np.testing.assert_array_equal(untaught.source_overlap, plain.source_overlap)
+    assert read_overlap(model, plain, 2.0) is plain  # nothing has learned to read it
 
+    model.verifier = PoseVerifier(3, 2, 4)
     model.verifier.reading.copy_(torch.tensor([1.5, -0.5, 0.25]))
     np.testing.assert_array_equal(predict(model, pair, 3, np.eye(4)).source_overlap, plain.source_overlap)
     odds = np.log(plain.source_overlap / (1.0 - plain.source_overlap))
     for plausibility, right in ((30.0, 1.0), (0.0, 0.5), (-np.log(3.0), 0.25), (-30.0, 0.0)):
-        read = predict(model, pair, 3, np.eye(4), plausibility)
+        read = read_overlap(model, plain, plausibility)
         expected = right / (1.0 + np.exp(-(1.5 * odds - 0.5))) + (1.0 - right) * 0.25
         np.testing.assert_allclose(read.source_overlap, expected, atol=1e-5)
         np.testing.assert_array_equal(read.source_raw, plain.source_raw)

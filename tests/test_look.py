@@ -12,7 +12,7 @@ from utopic_cli.errors import InputError
 from utopic_cli.estimation.candidates import Candidate
 from utopic_cli.estimation.evidence import SAME
 from utopic_cli.estimation.meeting import Meeting
-from utopic_cli.estimation.solver import Estimate
+from utopic_cli.estimation.solver import SURE, Estimate
 from utopic_cli.estimation.surface import Surface, make_surface
 from utopic_cli.geometry import rigid
 from utopic_cli.look import Look, look, look_both_sides
@@ -72,6 +72,7 @@ def test_only_an_answer_in_doubt_is_worth_another_sampling(
     seen = answering(prepared, 0.5, rival, support)
     assert seen.unclear is unclear
     shared = replace(seen, estimate=replace(seen.estimate, shared_points=True))
+    assert (seen.estimate.odds, shared.estimate.odds) == (0.0, SURE)
     assert not shared.unclear
 
 

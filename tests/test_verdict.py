@@ -49,6 +49,7 @@ def verdict(signals: dict[str, float] | None = None, rivals: Any = (), seen: Any
 def test_a_clear_answer_is_trusted_and_says_why() -> None:
     found = verdict()
     assert found.trusted and found.confidence == pytest.approx(1.0 / (1.0 + np.exp(-2.5)))
+    assert found.odds == pytest.approx(2.5)
     assert (
         len(found.reasons) == 1
         and "their surfaces agree as well as one scan does with itself, and no other" in found.reasons[0]
@@ -64,6 +65,13 @@ def test_confidence_under_the_threshold_is_not_trusted() -> None:
 def test_without_a_calibration_nothing_is_trusted() -> None:
     found = judge(None, GOOD, np.eye(4), (), FIXED, {"source": 0.7, "target": 0.7})
     assert (found.confidence, found.trusted, found.reasons) == (None, False, (UNCALIBRATED,))
+    assert found.odds is None
+
+
+def test_the_odds_of_a_certain_answer_are_finite() -> None:
+    for confidence in (0.0, 1.0):
+        odds = Verdict(confidence, False, ()).odds
+        assert odds is not None and abs(odds) == pytest.approx(np.log(999.0))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -85,9 +85,7 @@ class Eye:
         self.seed = seed
         self._seen: list[tuple[SampledCloud, CloudInput, EncodedCloud]] = []
 
-    def __call__(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
-    ) -> NetworkView:
+    def __call__(self, prepared: PreparedPair, hypothesis: np.ndarray | None = None) -> NetworkView:
         """Look at a prepared pair; see ``predict``."""
         device = next(self.model.parameters()).device
         with torch.inference_mode():
@@ -102,7 +100,7 @@ class Eye:
                 else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
                 encoded=(encoded_source, encoded_target),
             )
-        return _as_view(prediction, self.model, plausibility)
+        return _as_view(prediction, self.model)
 
     def _encode(self, cloud: SampledCloud, spacing: float) -> tuple[CloudInput, EncodedCloud]:
         for known, given, encoded in self._seen:
@@ -116,11 +114,7 @@ class Eye:
 
 
 def predict(
-    model: Utopic,
-    prepared: PreparedPair,
-    seed: int,
-    hypothesis: np.ndarray | None = None,
-    plausibility: float | None = None,
+    model: Utopic, prepared: PreparedPair, seed: int, hypothesis: np.ndarray | None = None
 ) -> NetworkView:
     """Run the network on a prepared pair, on the device its weights are on.
 
@@ -129,9 +123,26 @@ def predict(
         prepared: the pair.
         seed: seed of the overlap samples.
         hypothesis: (4, 4) transformation between the normalised clouds to judge the points by.
-        plausibility: log-odds that it is right; None: overlap stays as the network gives it.
     """
-    return Eye(model, seed)(prepared, hypothesis, plausibility)
+    return Eye(model, seed)(prepared, hypothesis)
+
+
+def read_overlap(model: Utopic, view: NetworkView, odds: float) -> NetworkView:
+    """Weigh the overlap that the network sees when shown a transformation with how likely that is right.
+
+    Args:
+        model: the network; without a verifier nothing changes.
+        view: of the network, shown the transformation.
+        odds: log-odds that it is right.
+    """
+    verifier = model.verifier
+    if verifier is None:
+        return view
+    source, target = (
+        verifier.read(torch.from_numpy(overlap).logit(eps=1e-6), odds).numpy()
+        for overlap in (view.source_overlap, view.target_overlap)
+    )
+    return replace(view, source_overlap=source, target_overlap=target)
 
 
 def verify(verifier: PoseVerifier, shown: Sequence[CloseUp]) -> np.ndarray:
@@ -143,13 +154,8 @@ def verify(verifier: PoseVerifier, shown: Sequence[CloseUp]) -> np.ndarray:
         return verifier(points, whole).cpu().numpy().astype(np.float64)
 
 
-def _as_view(prediction: Prediction, model: Utopic, plausibility: float | None) -> NetworkView:
+def _as_view(prediction: Prediction, model: Utopic) -> NetworkView:
     source_overlap, target_overlap = prediction.source_overlap, prediction.target_overlap
-    if model.verifier is not None and plausibility is not None:
-        source_overlap, target_overlap = (
-            model.verifier.read(logits, plausibility)
-            for logits in (prediction.source_overlap_logits, prediction.target_overlap_logits)
-        )
     if not model.config.overlap:  # the variant without O weighs all correspondences alike
         source_overlap, target_overlap = torch.ones_like(source_overlap), torch.ones_like(target_overlap)
     return NetworkView(

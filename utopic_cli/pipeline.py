@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.bridge import Eye, NetworkView, cpu_threads, load_network
+from utopic_cli.bridge import Eye, NetworkView, cpu_threads, load_network, read_overlap
 from utopic_cli.clock import Clock, Progress
 from utopic_cli.config import SOLVERS, AlignOptions, OptionValues
 from utopic_cli.errors import InputError, UsageError
@@ -155,9 +155,10 @@ def _register(
         clock.start("refine")
         transformation = refine(source, target, transformation, trees=trees).T_target_source
     normalised = prepared.normalise(transformation)
-    if model.config.hypothesis and options.solver != "svd":
+    shown = model.config.hypothesis and options.solver != "svd"
+    if shown:
         clock.start("look again")
-        view = see(prepared, normalised, estimate.best.plausibility)
+        view = see(prepared, normalised)
     clock.start("measure")
     spacings = [
         point_spacing(cloud.points, tree) for cloud, tree in zip((source, target), trees, strict=True)
@@ -175,6 +176,20 @@ def _register(
         for rival in estimate.rivals
         if estimate.best.standing - rival.standing < RIVAL_LAG
     )
+    verdict = judge(
+        calibration,
+        signals,
+        transformation,
+        rivals,
+        observability,
+        fit.overlap_ratio,
+        (extent(source.points), extent(target.points)),
+        # Only "auto" looks for all the rivals, and unrefined surfaces agree less.
+        usual=options.solver == "auto" and options.refine,
+        same=np.array_equal(source.points, target.points),
+    )
+    if shown:
+        view = read_overlap(model, view, estimate.odds if verdict.odds is None else verdict.odds)
     clock.start("carry to all points")
     source_all = _carry(
         frame.points[0],
@@ -187,18 +202,6 @@ def _register(
         prepared.target.points,
         view.target_overlap,
         view.target_uncertainty,
-    )
-    verdict = judge(
-        calibration,
-        signals,
-        transformation,
-        rivals,
-        observability,
-        fit.overlap_ratio,
-        (extent(source.points), extent(target.points)),
-        # Only "auto" looks for all the rivals, and unrefined surfaces agree less.
-        usual=options.solver == "auto" and options.refine,
-        same=np.array_equal(source.points, target.points),
     )
     return RegistrationResult(
         T_target_source=transformation,

@@ -67,6 +67,14 @@ class Verdict:
     trusted: bool
     reasons: tuple[str, ...]
 
+    @property
+    def odds(self) -> float | None:
+        """The confidence as log-odds, of at most a thousand to one."""
+        if self.confidence is None:
+            return None
+        bounded = min(max(self.confidence, 1e-3), 1.0 - 1e-3)
+        return float(np.log(bounded / (1.0 - bounded)))
+
 
 def read_calibration(card: dict[str, Any]) -> Calibration | None:
     """Return the calibration of a weights' card, or None if it has none.

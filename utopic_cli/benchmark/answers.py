@@ -214,7 +214,7 @@ class _Desk:
             if matcher.looks_again:
                 with _cpu(seconds, "look_again"):
                     normalised = look.prepared.normalise(T)
-                    again = matcher.look(look.prepared, normalised, look.estimate.best.plausibility)
+                    again = matcher.look(look.prepared, normalised, look.estimate.odds)
             for name, view in (("first", look.view), ("final", again)):
                 told[f"{name}_overlap"] = measure_overlap(view, self._known)
                 told[f"{name}_uncertainty"] = measure_uncertainty(look.prepared, view, self._known)

@@ -10,7 +10,7 @@ import numpy as np
 
 from utopic_cli.benchmark.fpfh import Fpfh
 from utopic_cli.benchmark.open3d_methods import load_open3d
-from utopic_cli.bridge import NetworkView, load_network, predict
+from utopic_cli.bridge import NetworkView, load_network, predict, read_overlap
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.preprocess import PreparedPair
 
@@ -89,7 +89,8 @@ class Network:
         self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
     ) -> NetworkView:
         """Run the network."""
-        return predict(self.model, prepared, self.seed, hypothesis, plausibility)
+        view = predict(self.model, prepared, self.seed, hypothesis)
+        return view if plausibility is None else read_overlap(self.model, view, plausibility)
 
 
 def load_matchers(

@@ -27,6 +27,7 @@ FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
 RIVALS = 5
 VERIFIED = 8  # best candidates that are looked at closely
+SURE = 5.0  # log-odds of an answer that rests on shared points
 SAME_PLACE = 0.15  # of the source's radius: what two samplings' answers to one question may differ by
 
 
@@ -62,6 +63,11 @@ class Estimate:
     def score(self) -> float:
         """The answer's fit minus free-space violation, at most 1."""
         return self.best.score
+
+    @property
+    def odds(self) -> float:
+        """Log-odds that the answer is right, as far as the solve can tell: 0 without a verifier."""
+        return SURE if self.shared_points else self.best.plausibility
 
     @property
     def support(self) -> float:
