@@ -12,8 +12,10 @@ from utopic_cli.benchmark.pair_metrics import known_nodes, measure_pose
 from utopic_cli.benchmark.protocols import SCAN_REACH, AnyProtocol, CropProtocol, RangeProtocol
 from utopic_cli.benchmark.trials import trial
 from utopic_cli.bridge import load_network, predict
+from utopic_cli.estimation.candidates import Candidate
 from utopic_cli.estimation.close_up import close_ups
-from utopic_cli.estimation.prior import ANYWHERE, Prior
+from utopic_cli.estimation.prior import Prior
+from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import solve
 from utopic_cli.look import problem_of
 from utopic_cli.point_cloud import PointCloud
@@ -124,31 +126,34 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
     model = load_network(weights, "cpu")[0]
     view = predict(model, prepared, 0)
     problem = problem_of(prepared, view)
-    prior = ANYWHERE if question.answer is None else Prior(prepared.normalise(question.answer))
     try:
-        estimate = solve(problem, prior=prior)
+        estimate = solve(problem)
     except ValueError:
         return None
     if estimate.shared_points:
         return None
-    candidates = (estimate.best, *estimate.rivals)
-    shown = close_ups(problem, candidates)
-    right = np.array([question.right(prepared.denormalise(each.T_target_source)) for each in candidates])
-    proposed = np.array([each.origin != "initial" for each in candidates])
+    candidates = [estimate.best, *estimate.rivals]
+    right = [question.right(prepared.denormalise(each.T_target_source)) for each in candidates]
+    proposed = [True] * len(candidates)
+    if question.answer is not None and not any(right):
+        missed = _missed(problem, prepared, question)
+        candidates += missed
+        right += [True] * len(missed)
+        proposed += [False] * len(missed)
     overlap, overlaps = np.zeros(0), np.zeros(0, bool)
     if number % OVERLAP_EVERY == 0:
         overlaps = _overlaps(prepared, question)
-        if (right & proposed).any():
-            best = candidates[int((right & proposed).argmax())]
-            again = predict(model, prepared, 0, best.T_target_source)
+        if any(right) and proposed[right.index(True)]:
+            again = predict(model, prepared, 0, candidates[right.index(True)].T_target_source)
             overlap = _logit(np.concatenate([again.source_overlap, again.target_overlap]))
+    shown = close_ups(problem, candidates)
     return Lesson(
         question.kind,
         question.shape,
         np.stack([one.points for one in shown]).astype(np.float16),
         np.stack([one.whole for one in shown]),
-        right,
-        proposed,
+        np.array(right),
+        np.array(proposed),
         np.array([each.standing for each in candidates]),
         overlap.astype(np.float32),
         overlaps,
@@ -166,6 +171,14 @@ def _overlaps(prepared: PreparedPair, question: Question) -> np.ndarray:
 def _logit(probability: np.ndarray) -> np.ndarray:
     probability = np.clip(probability, 1e-4, 1.0 - 1e-4)
     return np.log(probability / (1.0 - probability))
+
+
+def _missed(problem: Problem, prepared: PreparedPair, question: Question) -> list[Candidate]:
+    """Return what the known answer is drawn to, if that is right: what the solve ought to have proposed."""
+    assert question.answer is not None
+    told = solve(problem, prior=Prior(prepared.normalise(question.answer)))
+    found = [each for each in (told.best, *told.rivals) if each.origin == "initial"]
+    return [each for each in found if question.right(prepared.denormalise(each.T_target_source))]
 
 
 def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question:
