@@ -29,6 +29,7 @@ GOOD = {
     "spread": SAME,
     "support": -0.6,
     "margin": 0.5,
+    "plausibility": 0.0,
     "fixed": -1.0,
     "stiffness": 0.5,
 }
@@ -171,7 +172,8 @@ def test_an_answer_that_another_sampling_does_not_give_again_is_never_trusted() 
 
 def test_scans_that_contradict_each_other_are_never_trusted_however_likely_the_answer() -> None:
     assert verdict({"conflict": -0.7}).trusted  # in one way alone: where from is a guess
-    found = verdict({"conflict": -0.7, "contradiction": -1.2})
+    assert verdict({"conflict": -0.7, "contradiction": -1.2, "plausibility": 2.1}).trusted
+    found = verdict({"conflict": -0.7, "contradiction": -1.2, "plausibility": 1.9})
     assert not found.trusted and found.confidence == verdict().confidence
     assert found.reasons == ("parts of one scan stand where the other saw empty space",)
 

@@ -38,7 +38,10 @@ MOST_CONTRADICTION = -1.3
 """With a larger one (log10: a twentieth) an answer is not trusted, whatever else speaks for it: nothing
 else tells a body from its mirror image where most of it is symmetric. Both ways must see it, since the
 place a scan was taken from is a guess: where that is wrong, one way sees much conflict and the other
-hardly any."""
+hardly any. What the verifier finds ``PLAUSIBLE`` all the same is let pass."""
+
+PLAUSIBLE = 2.0
+"""Log-odds of a verifier that has learned from mirror images, too: of the demo's it says -5."""
 
 LIMP = 0.02
 """A stiffness of no more: displaced by what a right answer may be off by, the source fits as well."""
@@ -103,11 +106,12 @@ def ruled_out(signals: dict[str, float]) -> bool:
     """Tell whether an answer is not to be trusted, however likely it is.
 
     Along a motion that the surfaces leave free, or that they do not notice, it is right by luck alone;
-    scans that contradict each other can't both be right, nor can two answers to two samplings of the
-    same scans.
+    scans that contradict each other can't both be right, unless the verifier finds that they only seem to;
+    nor can two answers to two samplings of the same scans.
     """
     undetermined = signals["fixed"] < np.log10(FREE) or signals["stiffness"] <= LIMP
-    return bool(undetermined or signals["contradiction"] > MOST_CONTRADICTION or signals["spread"] > APART)
+    contradicting = signals["contradiction"] > MOST_CONTRADICTION and signals["plausibility"] < PLAUSIBLE
+    return bool(undetermined or contradicting or signals["spread"] > APART)
 
 
 def judge(

@@ -11,7 +11,7 @@ from utopic_cli.benchmark import calibration
 from utopic_cli.benchmark.calibration import MOST_RISK, Outcome, calibrate, fit, outcome_of
 from utopic_cli.errors import InputError, UsageError
 
-FINE = {"fixed": -1.0, "contradiction": -2.5, "spread": -3.0, "stiffness": 0.5}
+FINE = {"fixed": -1.0, "contradiction": -2.5, "plausibility": 0.0, "spread": -3.0, "stiffness": 0.5}
 
 
 def outcomes(count: int, seed: int, steepness: float = 6.0) -> list[Outcome]:
