@@ -126,3 +126,12 @@ def test_a_pair_nothing_follows_from_is_an_input_error() -> None:
 
     with pytest.raises(InputError, match="no transformation can be found"):
         look(see, pair, "consensus")
+
+
+def test_scans_that_face_each_other_outrank_nothing(prepared: PreparedPair) -> None:
+    """Two planes with their normals on opposite sides lie on each other closely, and agree nowhere."""
+    plain, close = answering(prepared, 0.3, None).estimate, answering(prepared, 0.9, None).estimate
+    assert close.outranks(plain) and not plain.outranks(close)
+    assert close.best.meeting is not None
+    facing = replace(close, best=replace(close.best, meeting=replace(close.best.meeting, agreement=0.0)))
+    assert plain.outranks(facing) and not facing.outranks(plain)
