@@ -128,10 +128,17 @@ def test_a_pair_nothing_follows_from_is_an_input_error() -> None:
         look(see, pair, "consensus")
 
 
-def test_scans_that_face_each_other_outrank_nothing(prepared: PreparedPair) -> None:
-    """Two planes with their normals on opposite sides lie on each other closely, and agree nowhere."""
-    plain, close = answering(prepared, 0.3, None).estimate, answering(prepared, 0.9, None).estimate
-    assert close.outranks(plain) and not plain.outranks(close)
-    assert close.best.meeting is not None
-    facing = replace(close, best=replace(close.best, meeting=replace(close.best.meeting, agreement=0.0)))
-    assert plain.outranks(facing) and not facing.outranks(plain)
+def test_scans_that_face_each_other_outrank_nothing_and_are_no_rivals(prepared: PreparedPair) -> None:
+    """Two sheets with their normals on opposite sides lie on each other closely, and agree nowhere."""
+    plain, close = answering(prepared, 0.3, None), answering(prepared, 0.9, None)
+    best = close.estimate.best
+    assert close.estimate.outranks(plain.estimate) and best.meeting is not None
+    facing = replace(
+        best,
+        T_target_source=rigid.rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3)),
+        meeting=replace(best.meeting, likeness=0.0),
+    )
+    other = replace(close, estimate=replace(close.estimate, best=facing))
+    assert not other.estimate.outranks(plain.estimate)
+    joined = plain.joined(other).estimate
+    assert joined.best is plain.estimate.best and joined.rivals == (facing,) and joined.margin == 1.0

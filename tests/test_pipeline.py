@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from utopic_cli import align
+from utopic_cli import align, pipeline
+from utopic_cli.bridge import read_overlap
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.geometry import rigid
@@ -54,6 +55,30 @@ def test_every_original_point_gets_an_overlap_and_an_uncertainty(pair, result):
     ):
         assert values.shape == (len(cloud),) and values.dtype == np.float32
         assert values.min() >= 0 and values.max() <= 1 and np.ptp(values) > 0.1
+
+
+def test_overlap_is_weighed_with_the_confidence(pair, result, monkeypatch):
+    """With the confidence where there is one, else with what the solve makes of it."""
+    weighed = []
+
+    def noted(model, view, odds):
+        weighed.append(odds)
+        return read_overlap(model, view, odds)
+
+    monkeypatch.setattr(pipeline, "read_overlap", noted)
+    again = register(pair.source, pair.target, OPTIONS)
+    assert np.array_equal(again.source_overlap, result.source_overlap)
+    confidence = min(max(result.confidence, 0.001), 0.999)
+    assert weighed == [pytest.approx(np.log(confidence / (1.0 - confidence)))]
+
+    doubted = []
+    monkeypatch.setattr(pipeline, "read_calibration", lambda card: None)
+    monkeypatch.setattr(
+        pipeline, "read_overlap", lambda *given: doubted.append(given) or read_overlap(*given)
+    )
+    uncalibrated = register(pair.source, pair.target, OPTIONS)
+    assert uncalibrated.confidence is None
+    assert [odds for _, _, odds in doubted] == [uncalibrated.signals["plausibility"]]
 
 
 def known_overlap(pair):

@@ -138,10 +138,7 @@ def read_overlap(model: Utopic, view: NetworkView, odds: float) -> NetworkView:
     verifier = model.verifier
     if verifier is None:
         return view
-    source, target = (
-        verifier.read(torch.from_numpy(overlap).logit(eps=1e-6), odds).numpy()
-        for overlap in (view.source_overlap, view.target_overlap)
-    )
+    source, target = (verifier.read(overlap, odds) for overlap in (view.source_overlap, view.target_overlap))
     return replace(view, source_overlap=source, target_overlap=target)
 
 

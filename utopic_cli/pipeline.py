@@ -189,7 +189,8 @@ def _register(
         same=np.array_equal(source.points, target.points),
     )
     if shown:
-        view = read_overlap(model, view, estimate.odds if verdict.odds is None else verdict.odds)
+        calibrated = None if estimate.shared_points else verdict.odds  # no calibration knows such points
+        view = read_overlap(model, view, estimate.odds if calibrated is None else calibrated)
     clock.start("carry to all points")
     source_all = _carry(
         frame.points[0],

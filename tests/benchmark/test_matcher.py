@@ -63,6 +63,18 @@ def test_dual_softmax_rewards_mutual_preference() -> None:
     assert np.isfinite(dual_softmax(np.ones((2, 2)))).all()
 
 
+def test_overlap_is_weighed_where_the_odds_are_told(clouds) -> None:
+    source, target, gt = clouds
+    (network,) = load_matchers(["utopic"], [], 0, "cpu")
+    prepared = prepare(source, target, 200)
+    T = prepared.normalise(gt)
+    plain, sure, unlikely = (network.look(prepared, T, odds) for odds in (None, 6.0, -6.0))
+    usual = network.model.verifier.reading[2].item()
+    np.testing.assert_allclose(unlikely.source_overlap, usual, atol=0.01)
+    assert np.ptp(sure.source_overlap) > 0.5 and not np.allclose(sure.source_overlap, plain.source_overlap)
+    np.testing.assert_array_equal(sure.source_raw, plain.source_raw)
+
+
 def test_weights_of_one_name_are_told_apart(tmp_path) -> None:
     from utopic_cli.model.weights import find_weights
 

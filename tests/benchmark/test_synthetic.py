@@ -52,13 +52,13 @@ class Oracle:
     def settings(self) -> dict[str, str]:
         return {}
 
-    def look(self, prepared, hypothesis=None, plausibility=None) -> NetworkView:
+    def look(self, prepared, hypothesis=None, odds=None) -> NetworkView:
         moved = apply(prepared.normalise(self.gt), prepared.source.points)
         distance = np.linalg.norm(moved[:, None] - prepared.target.points[None], axis=2)
         scores = np.exp(-0.5 * (distance / (0.3 * prepared.spacing)) ** 2)
         n, m = scores.shape
         said = 0.0 if hypothesis is None else 1.0
-        assert (plausibility is None) == (hypothesis is None)
+        assert (odds is None) == (hypothesis is None)
         return NetworkView(
             scores, np.full(n, said), np.full(m, said), np.zeros(n), np.zeros(m), np.zeros(n), np.zeros(m)
         )
@@ -94,7 +94,7 @@ def test_scores_that_lead_nowhere_are_a_counted_failure(shapes: ShapeLibrary) ->
     class Blind(Oracle):
         name, tells_overlap, looks_again = "blind", False, False
 
-        def look(self, prepared, hypothesis=None, plausibility=None) -> NetworkView:
+        def look(self, prepared, hypothesis=None, odds=None) -> NetworkView:
             view = super().look(prepared)
             return replace(view, matching_scores=np.zeros_like(view.matching_scores))
 

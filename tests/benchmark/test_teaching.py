@@ -82,6 +82,9 @@ def test_overlap_is_read_as_it_turned_out(lessons):
     assert np.allclose(verifier.reading.numpy(), [slope, shift, usual])
     told = described["overlap"]
     assert told["points"] == 6000 and told["accuracy"] > told["accuracy_as_it_is"] + 0.1
+    assert reading_of(lessons[:4]).tolist() == [1.0, 0.0, 0.0]  # too few to tell
+    turned = [replace(lesson, overlap=-lesson.overlap) for lesson in lessons[:60]]
+    assert reading_of(turned).tolist() == [1.0, 0.0, 0.0]
     alone = [replace(lesson, overlaps=np.ones(100, bool)) for lesson in lessons[:60]]
     assert reading_of(alone).tolist() == [1.0, 0.0, 0.0]
 
@@ -128,7 +131,9 @@ def test_a_lesson_holds_the_known_answer_and_what_the_solve_proposed():
         count = len(lesson.right)
         assert lesson.points.shape[0] == lesson.whole.shape[0] == len(lesson.by_surfaces) == count
         assert lesson.points.shape[2] == POINT_FEATURES and np.isfinite(lesson.points).all()
-        if lesson.kind in ("different", "mirrored"):
+        if not lesson.proposed.all():  # the solve had missed what it is told
+            assert not lesson.right[lesson.proposed].any() and lesson.right[~lesson.proposed].all()
+        if lesson.kind in ("different", "mirrored", "disjoint"):
             assert not lesson.right.any() and lesson.proposed.all()
     first = lessons[0]
     assert len(first.overlap) == len(first.overlaps) > 400 and first.overlaps.any()

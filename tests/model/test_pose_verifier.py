@@ -46,6 +46,7 @@ def test_features_are_brought_to_one_scale_and_cut_off(verifier):
 def test_a_verifier_is_kept_with_the_weights(tmp_path, verifier):
     model = Utopic(ModelConfig(**SMALL))
     model.verifier = verifier
+    verifier.reading.copy_(torch.tensor([1.5, -0.5, 0.25]))
     blob, card = pack_weights(model, {"verifier": {"pairs": 7}})
     path = tmp_path / "tiny.safetensors"
     path.write_bytes(blob)
@@ -53,6 +54,7 @@ def test_a_verifier_is_kept_with_the_weights(tmp_path, verifier):
     loaded, described = load_weights(str(path))
     assert described["verifier"] == {"pairs": 7, "sizes": verifier.sizes}
     assert loaded.verifier is not None and not loaded.verifier.training
+    assert loaded.verifier.reading.tolist() == [1.5, -0.5, 0.25]
     points, whole = torch.randn(2, 20, 6), torch.randn(2, 3)
     torch.testing.assert_close(loaded.verifier(points, whole), verifier(points, whole), atol=1e-2, rtol=1e-2)
     described = json.loads(path.with_suffix(".json").read_text())

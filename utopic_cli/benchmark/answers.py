@@ -60,7 +60,7 @@ class Answer:
         pose: how far it is off, or None.
         matches: of the view that the answer rests on; None for the floor and for methods.
         first_overlap: overlap told without a transformation; None from who tells none.
-        final_overlap: overlap told when shown the answer (the pipeline's last look).
+        final_overlap: overlap told when shown the answer, weighed with the solve's odds that it is right.
         first_uncertainty: raw uncertainty by place at the first look; None from who tells no overlap.
         final_uncertainty: the same when shown the answer.
         score: the solver's score of it.

@@ -48,7 +48,7 @@ class Fpfh:
         }
 
     def look(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, odds: float | None = None
     ) -> NetworkView:
         """Return its view of a prepared pair; a transformation changes nothing."""
         features = [_node_features(cloud, prepared.spacing) for cloud in (prepared.source, prepared.target)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from utopic_cli.benchmark.held_out import made_of
 from utopic_cli.benchmark.pair_metrics import known_nodes, measure_pose
-from utopic_cli.benchmark.protocols import SCAN_REACH, AnyProtocol, CropProtocol, RangeProtocol
+from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
 from utopic_cli.benchmark.trials import trial
 from utopic_cli.bridge import load_network, predict
 from utopic_cli.estimation.candidates import Candidate
@@ -18,9 +18,10 @@ from utopic_cli.estimation.prior import Prior
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import solve
 from utopic_cli.look import problem_of
+from utopic_cli.model.pose_verifier import overlap_logits
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, prepare
-from utopic_cli.synthesis.scan_pair import ScanPair
+from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair
 from utopic_cli.synthesis.settings import PairSettings
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
@@ -40,8 +41,8 @@ MIXTURE: tuple[tuple[float, AnyProtocol], ...] = (
 """What the pairs are, with their shares; the rest are ``TRIALS``."""
 
 TRIALS = ("scans", "patch", "sparse", "room", "near-symmetric", "little", "disjoint", "different", "mirrored")
-"""Kinds of trials among the lessons: rougher scans, and what is no scan of a shape. Not those where nothing
-tells a right pose from a wrong one."""
+"""Kinds of trials among the lessons: rougher scans, and what is no scan of a shape. Not those where hardly
+ever anything tells a right pose from a wrong one, nor what ``MIXTURE`` has."""
 
 DIFFERENT, MIRRORED = 0.10, 0.05
 """Shares of the other pairs that nothing puts right: scans of two shapes, and of a shape and its mirror
@@ -63,8 +64,9 @@ class Lesson:
         shape: what was scanned.
         points: (C, P, F) float16, of each candidate's close-up.
         whole: (C, G) float32.
-        right: (C,) whether it is right, or as good by symmetry.
-        proposed: (C,) whether the solve came upon it; False for the known answer itself.
+        right: (C,) whether it is right; see ``Question``.
+        proposed: (C,) whether the solve came upon it; False for what the known answer is drawn to, which is
+            among them where the solve missed it.
         by_surfaces: (C,) its standing by the surfaces alone.
         overlap: (N,) what the network makes of the pair's points when shown a right pose that was proposed,
             as logits; empty without one, and but for every fourth pair.
@@ -92,7 +94,7 @@ class Question:
         source: the scan that moves.
         target: the scan that stays.
         answer: (4, 4) T_target_source; None where nothing puts the pair right.
-        right: tells whether a (4, 4) answer is right, or as good by symmetry.
+        right: tells whether a (4, 4) answer is right, or, except in a trial, as good by symmetry.
         scans: whether scattered points are left out first, as of scans.
         radius: called with the prepared pair: points nearer than this overlap, normalised units.
     """
@@ -108,7 +110,7 @@ class Question:
 
 
 def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: int) -> Lesson | None:
-    """Make pair ``number`` and solve it; None where nothing follows, or single points decide.
+    """Make pair ``number`` and solve it; None where there is none, nothing follows, or points decide.
 
     Args:
         weights: as of ``load_network``.
@@ -122,6 +124,8 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
     """
     with made_of(data):
         question = question_of(shapes, seed, number)
+    if question is None:
+        return None
     prepared = prepare(question.source, question.target, POINTS, clean=question.scans)
     model = load_network(weights, "cpu")[0]
     view = predict(model, prepared, 0)
@@ -145,7 +149,7 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
         overlaps = _overlaps(prepared, question)
         if any(right) and proposed[right.index(True)]:
             again = predict(model, prepared, 0, candidates[right.index(True)].T_target_source)
-            overlap = _logit(np.concatenate([again.source_overlap, again.target_overlap]))
+            overlap = overlap_logits(np.concatenate([again.source_overlap, again.target_overlap]))
     shown = close_ups(problem, candidates)
     return Lesson(
         question.kind,
@@ -168,11 +172,6 @@ def _overlaps(prepared: PreparedPair, question: Question) -> np.ndarray:
     return np.concatenate([known.source_overlap, known.target_overlap])
 
 
-def _logit(probability: np.ndarray) -> np.ndarray:
-    probability = np.clip(probability, 1e-4, 1.0 - 1e-4)
-    return np.log(probability / (1.0 - probability))
-
-
 def _missed(problem: Problem, prepared: PreparedPair, question: Question) -> list[Candidate]:
     """Return what the known answer is drawn to, if that is right: what the solve ought to have proposed."""
     assert question.answer is not None
@@ -181,66 +180,56 @@ def _missed(problem: Problem, prepared: PreparedPair, question: Question) -> lis
     return [each for each in found if question.right(prepared.denormalise(each.T_target_source))]
 
 
-def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question:
+def question_of(shapes: ShapeLibrary, seed: int, number: int) -> Question | None:
     """Make pair ``number``; it depends on the arguments alone.
+
+    Returns:
+        The pair; None where it is to be a trial, and the shapes make none of its kind.
 
     Raises:
         DegeneratePair: no such pair can be made of the shapes.
     """
-    rng = np.random.default_rng([seed, number])
+    rng = np.random.default_rng([seed, number, 1])  # other draws than those that choose the shape
     place = int(np.searchsorted(np.cumsum([share for share, _ in MIXTURE]), rng.random(), side="right"))
     if place == len(MIXTURE):
-        one = trial(shapes, seed, number, TRIALS)
-        return Question(
-            one.kind, one.shape, one.source, one.target, one.gt_T_target_source, one.right, True, _scan_radius
-        )
+        return _trial(shapes, seed, number)
     protocol = MIXTURE[place][1]
     pair = protocol.pair(shapes, seed, number)
     draw = rng.random()
     if draw < DIFFERENT:
         other = protocol.pair(shapes, seed + OTHERS, number)
-        return _hopeless("different", protocol, replace(pair, target=other.target))
+        return _question("different", protocol, replace(pair, target=other.target), solvable=False)
     if draw < DIFFERENT + MIRRORED:
         mirror = np.ones(3)
         mirror[rng.integers(3)] = -1.0
-        return _hopeless("mirrored", protocol, replace(pair, source=PointCloud(pair.source.points * mirror)))
+        mirrored = replace(pair, source=PointCloud(pair.source.points * mirror))
+        return _question("mirrored", protocol, mirrored, solvable=False)
+    return _question(protocol.name, protocol, pair, solvable=True)
 
+
+def _trial(shapes: ShapeLibrary, seed: int, number: int) -> Question | None:
+    try:
+        one = trial(shapes, seed, number, TRIALS)
+    except DegeneratePair:  # two like shapes, say, or only symmetric ones
+        return None
+    radius = MIXTURE[-1][1].overlap_radius  # as of any scans
+    return Question(
+        one.kind, one.shape, one.source, one.target, one.gt_T_target_source, one.right, True, radius
+    )
+
+
+def _question(kind: str, protocol: AnyProtocol, pair: ScanPair, *, solvable: bool) -> Question:
     def right(T: np.ndarray) -> bool:
-        return measure_pose(
+        measured = measure_pose(
             T,
             pair.gt_T_target_source,
             protocol.unit(pair),
             centre=protocol.centre(pair),
             object_points=pair.object_points,
             extent=pair.extent,
-        ).symmetric
+        )
+        return solvable and measured.symmetric
 
-    shape, answer = str(pair.shape), pair.gt_T_target_source
-    return Question(
-        protocol.name,
-        shape,
-        pair.source,
-        pair.target,
-        answer,
-        right,
-        protocol.cleans,
-        protocol.overlap_radius,
-    )
-
-
-def _hopeless(kind: str, protocol: AnyProtocol, pair: ScanPair) -> Question:
-    shape = str(pair.shape)
-    return Question(
-        kind,
-        shape,
-        pair.source,
-        pair.target,
-        None,
-        lambda T: False,
-        protocol.cleans,
-        protocol.overlap_radius,
-    )
-
-
-def _scan_radius(prepared: PreparedPair) -> float:
-    return SCAN_REACH * prepared.spacing
+    answer = pair.gt_T_target_source if solvable else None
+    shape, radius = str(pair.shape), protocol.overlap_radius
+    return Question(kind, shape, pair.source, pair.target, answer, right, protocol.cleans, radius)

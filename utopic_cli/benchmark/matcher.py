@@ -41,14 +41,14 @@ class Matcher(Protocol):
         ...
 
     def look(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, odds: float | None = None
     ) -> NetworkView:
         """Say what it sees, shown a (4, 4) transformation of the normalised clouds or none.
 
         Args:
             prepared: the pair.
             hypothesis: the transformation.
-            plausibility: log-odds that it is right; None: overlap stays as the network gives it.
+            odds: log-odds that it is right; None: overlap stays as the network gives it.
         """
         ...
 
@@ -86,11 +86,11 @@ class Network:
         }
 
     def look(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, plausibility: float | None = None
+        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, odds: float | None = None
     ) -> NetworkView:
         """Run the network."""
         view = predict(self.model, prepared, self.seed, hypothesis)
-        return view if plausibility is None else read_overlap(self.model, view, plausibility)
+        return view if odds is None else read_overlap(self.model, view, odds)
 
 
 def load_matchers(

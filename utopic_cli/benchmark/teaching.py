@@ -33,6 +33,7 @@ BY_ITSELF = 0.5
 
 FOLDS = 3
 FEWEST = 30
+FEWEST_SHOWN = 5
 
 
 def teach(
@@ -156,16 +157,18 @@ def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
 def reading_of(lessons: Sequence[Lesson]) -> np.ndarray:
     """Fit how to read overlap (3,); see ``PoseVerifier``.
 
-    Slope and shift are 1 and 0 where right poses show no overlap, or nothing else.
+    Slope and shift are 1 and 0 where fewer than ``FEWEST_SHOWN`` pairs were shown with a right pose, or these
+    show no overlap, or nothing else, or less of it the more the network gives.
     """
     without = [lesson.overlaps.mean() for lesson in lessons if len(lesson.overlaps) > len(lesson.overlap)]
     usual = float(np.mean(without)) if without else 0.0
+    as_it_is = np.array([1.0, 0.0, usual])
     logits, overlaps = _shown(lessons)
-    if not overlaps.any() or overlaps.all():
-        return np.array([1.0, 0.0, usual])
+    if sum(bool(len(one.overlap)) for one in lessons) < FEWEST_SHOWN or not overlaps.any() or overlaps.all():
+        return as_it_is
     model = fit_calibration(("logit",), logits[:, None].astype(np.float64), overlaps, threshold=0.5)
     slope = model.coefficients[0] / model.deviation[0]
-    return np.array([slope, model.intercept - slope * model.mean[0], usual])
+    return np.array([slope, model.intercept - slope * model.mean[0], usual]) if slope > 0 else as_it_is
 
 
 def _shown(lessons: Sequence[Lesson]) -> tuple[np.ndarray, np.ndarray]:

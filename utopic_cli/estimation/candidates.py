@@ -28,6 +28,8 @@ REFINED = 8  # measured: what ranks lower after screening never turns out best
 REFINED_SPARSE = 30  # partners may yet speak for it
 APPROACHED = 3
 PLAUSIBILITY_WEIGHT = 0.1  # of a log-odds, in voxels
+LEAST_LIKENESS = 0.03
+FACING = 2.0  # voxels: behind whatever does not
 LEAST_SUPPORT = 1e-3  # of the correspondences' weight: less is the same
 MOST_TURNING = 0.5  # beyond it, normals contradict each other
 MOST_CONFLICT = 0.3
@@ -67,8 +69,9 @@ class Candidate:
         (a nearly symmetric thing, half a turn off) better than a right one of scans that share little.
         Under the right one the surfaces lie closer where they meet (which says the more the more they
         turn there: flat on flat is always close), more of the correspondences are explained, and hardly
-        anything stands where the other scan saw nothing. A verifier, which has seen more than such
-        averages, has the last word.
+        anything stands where the other scan saw nothing. Scans that meet and agree next to nowhere face each
+        other (two sheets with their normals on opposite sides), however closely they lie. A verifier, which
+        has seen more than such averages, has the last word.
 
         Raises:
             ValueError: it was not weighed.
@@ -79,7 +82,8 @@ class Candidate:
         shape = min(self.meeting.turning, MOST_TURNING)
         conflict = min(self.meeting.conflict, MOST_CONFLICT)
         by_surfaces = 0.08 * support - self.meeting.looseness + 0.2 * shape - 0.7 * conflict
-        return float(by_surfaces + PLAUSIBILITY_WEIGHT * self.plausibility)
+        facing = FACING if self.meeting.likeness < LEAST_LIKENESS else 0.0
+        return float(by_surfaces - facing + PLAUSIBILITY_WEIGHT * self.plausibility)
 
 
 def screen(

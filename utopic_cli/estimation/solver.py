@@ -27,7 +27,6 @@ FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
 RIVALS = 5
 VERIFIED = 8  # best candidates that are looked at closely
-LEAST_AGREEMENT = 0.02
 SURE = 5.0  # log-odds of an answer that rests on shared points
 SAME_PLACE = 0.15  # of the source's radius: what two samplings' answers to one question may differ by
 
@@ -67,7 +66,10 @@ class Estimate:
 
     @property
     def odds(self) -> float:
-        """Log-odds that the answer is right, as far as the solve can tell: 0 without a verifier."""
+        """Log-odds that the answer is right, as far as the solve can tell.
+
+        ``SURE`` where it rests on shared points, else of the verifier; 0 where none was asked.
+        """
         return SURE if self.shared_points else self.best.plausibility
 
     @property
@@ -83,13 +85,7 @@ class Estimate:
 
     def outranks(self, other: Estimate) -> bool:
         """Tell whether more speaks for this estimate than for another one of the same scans."""
-        return self._rank > other._rank
-
-    @property
-    def _rank(self) -> tuple[bool, bool, float]:
-        """What outranks: where next to nothing agrees the scans face each other, however closely they lie."""
-        met = self.best.meeting
-        return self.shared_points, met is not None and met.agreement > LEAST_AGREEMENT, self.best.standing
+        return (self.shared_points, self.best.standing) > (other.shared_points, other.best.standing)
 
     def with_rivals(self, other: Estimate, points: np.ndarray) -> Estimate:
         """Return this estimate with another one of the same scans, and its rivals, among its rivals.

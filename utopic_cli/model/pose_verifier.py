@@ -8,9 +8,9 @@ With it comes how to read the overlap that the network gives when it is shown a 
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import torch
+from scipy.special import expit, logit
 from torch import Tensor, nn
 
 from utopic_cli.model.one_thread import one_thread
@@ -19,6 +19,15 @@ LARGEST = 5.0
 """Standard deviations; features are cut off beyond."""
 
 POOLS = 4
+
+
+CERTAIN = 1e-4
+"""Overlap is taken to be no surer than this."""
+
+
+def overlap_logits(overlap: np.ndarray) -> np.ndarray:
+    """Return probabilities (N,) as finite logits."""
+    return np.asarray(logit(np.clip(overlap, CERTAIN, 1.0 - CERTAIN)))
 
 
 class PoseVerifier(nn.Module):
@@ -69,18 +78,18 @@ class PoseVerifier(nn.Module):
             getattr(self, f"{name}_mean").copy_(flat.mean(dim=0))
             getattr(self, f"{name}_scale").copy_(flat.std(dim=0) + 1e-3)
 
-    def read(self, overlap_logits: Tensor, plausibility: float) -> Tensor:
-        """Return probabilities of overlap, of the same shape, where the network was shown a pose.
+    def read(self, overlap: np.ndarray, odds: float) -> np.ndarray:
+        """Return probabilities of overlap (N,) where the network was shown a pose.
 
         What it then sees holds if the pose is right; if it is not, nothing is known but what is usual then.
 
         Args:
-            overlap_logits: the network's.
-            plausibility: log-odds that the pose is right.
+            overlap: (N,) the network's.
+            odds: log-odds that the pose is right.
         """
-        slope, shift, usual = self.reading
-        right = 1.0 / (1.0 + math.exp(-plausibility))
-        return right * torch.sigmoid(slope * overlap_logits + shift) + (1.0 - right) * usual
+        slope, shift, usual = self.reading.tolist()
+        right = expit(odds)
+        return np.asarray(right * expit(slope * overlap_logits(overlap) + shift) + (1.0 - right) * usual)
 
     @one_thread()
     def forward(self, points: Tensor, whole: Tensor) -> Tensor:
