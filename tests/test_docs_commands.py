@@ -45,7 +45,7 @@ SMALLER = {
     r"^utopic bench (?!scans).*": r"\g<0> --points 100",
     r"^utopic bench scans DIR --poses 3": r"utopic bench scans scans --poses 1",
     r"--pairs \d+": "--pairs 2",
-    r"^utopic teach .*": r"\g<0> --pairs 40 --workers 2",
+    r"^utopic teach .*": r"\g<0> --pairs 70 --workers 2",
     r"--train-pairs \d+": "--train-pairs 4",
 }
 """By regular expressions, what stands for a part of a command; all that match are applied, in this order."""
