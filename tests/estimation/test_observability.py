@@ -22,7 +22,7 @@ VOXEL = 0.05
 def surface(points: np.ndarray, viewpoint: np.ndarray) -> Surface:
     """A scan as the solver sees it: one point a voxel, normals from neighbours."""
     dense, _ = voxel_downsample(points, VOXEL)
-    normals = orient_towards(dense, estimate_normals(dense, 30, 3 * VOXEL), viewpoint)
+    normals = orient_towards(dense, estimate_normals(dense, softness=VOXEL), viewpoint)
     return make_surface(PointCloud(dense, normals), VOXEL)
 
 

@@ -69,15 +69,29 @@ def test_normals_of_some_points_are_those_among_all() -> None:
     rows = np.array([700, 3, 1400])
     some = estimate_normals(points, 16, 0.2, tree=cKDTree(points), at=rows)
     np.testing.assert_array_equal(some, estimate_normals(points, 16, 0.2)[rows])
+    assert not np.array_equal(some, estimate_normals(points, 16)[rows])
     assert estimate_normals(points, 16, at=rows[:0]).shape == (0, 3)
 
 
-def test_a_normal_is_the_least_axis_of_the_neighbours_within_the_radius() -> None:
+def test_a_normal_is_the_least_axis_of_the_weighted_neighbours() -> None:
     points = np.random.default_rng(4).standard_normal((400, 3))
-    normals = estimate_normals(points, 12, 0.6)
+    normals = estimate_normals(points, 12, 0.3)
     distance = np.linalg.norm(points[:, None] - points, axis=2)
     for i in (0, 17, 399):
         nearest = np.argsort(distance[i])[:12]
-        near = points[nearest[(distance[i, nearest] <= 0.6) | (np.arange(12) < 3)]]
-        least = np.linalg.eigh(np.cov(near.T))[1][:, 0]
+        weights = np.exp(-0.5 * (distance[i, nearest] / 0.3) ** 2)
+        weights[:3] = 1.0  # an outlier far from everything has a plane all the same
+        least = np.linalg.eigh(np.cov(points[nearest].T, aweights=weights))[1][:, 0]
         assert abs(least @ normals[i]) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_near_points_tell_the_normal_at_an_edge() -> None:
+    rng = np.random.default_rng(5)
+    floor = np.column_stack([rng.uniform(0, 1, (1500, 2)), np.zeros(1500)])
+    wall = np.column_stack([np.zeros(1500), rng.uniform(0, 1, (1500, 2))])
+    points = np.concatenate([floor, wall])
+    at = np.flatnonzero((floor[:, 0] > 0.03) & (floor[:, 0] < 0.06))
+    upright = [
+        np.abs(estimate_normals(points, 30, softness, at=at)[:, 2]).mean() for softness in (0.025, np.inf)
+    ]
+    assert upright[0] > 0.98 > upright[1]

@@ -15,7 +15,7 @@ BLOCK = 4096  # points looked at at a time: what they take stays in the cache
 def estimate_normals(
     points: np.ndarray,
     neighbours: int = 30,
-    radius: float = np.inf,
+    softness: float = np.inf,
     *,
     tree: cKDTree | None = None,
     at: np.ndarray | None = None,
@@ -25,8 +25,8 @@ def estimate_normals(
     Args:
         points: (N, 3) float64.
         neighbours: most neighbours used, the point itself included.
-        radius: neighbours farther away are ignored (points' units); where fewer than three
-            are left, the nearest ones are used all the same.
+        softness: standard deviation of the Gaussian in the distance by which neighbours count (points'
+            units); the nearest three, the point itself included, always count fully.
         tree: of the points, if there is one already.
         at: (K,) rows of the points whose normals are asked for; None for all.
 
@@ -42,7 +42,7 @@ def estimate_normals(
     for start in range(0, len(rows), BLOCK):
         block = slice(start, start + BLOCK)
         index = indices[block]
-        weight = (distances[block] <= radius).astype(np.float64)
+        weight = np.exp(-0.5 * (distances[block] / softness) ** 2)
         weight[:, : min(3, k)] = 1.0
         weight /= weight.sum(axis=1, keepdims=True)
         centred = []

@@ -16,27 +16,32 @@ NEIGHBOURS, TREE_NEIGHBOURS = 30, 16
 NONE = torch.iinfo(torch.int64).max
 
 
-def plane_normals(points: Tensor, distance: Tensor, index: Tensor, draws: Draws) -> Tensor:
+def plane_normals(points: Tensor, distance: Tensor, index: Tensor, softness: Tensor, draws: Draws) -> Tensor:
     """Fit a plane to each point's neighbourhood; see ``geometry.normals.estimate_normals``.
 
     Args:
         points: (K, 3).
         distance: (K, k) to the nearest points, infinity where there are fewer in reach.
         index: (K, k) rows of ``points``.
+        softness: (K,) standard deviation of the Gaussian by which neighbours count.
         draws: a point with fewer than three in reach gets a random normal: an outlier's own
             plane means nothing either.
 
     Returns:
         (K, 3) unit normals of arbitrary sign.
     """
-    weight = distance.isfinite().float()[..., None]
-    count = weight.sum(dim=1)
-    offsets = (points[index] - points[:, None]) * weight
-    mean = offsets.sum(dim=1) / count.clamp_min(1)
-    x, y, z = ((offsets - mean[:, None]) * weight).unbind(-1)
+    near = distance.isfinite()
+    weight = torch.exp(-0.5 * (distance / softness[:, None]).square())
+    weight[:, :3] = near[:, :3].float()
+    weight = (weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30))[..., None]
+    offsets = points[index] - points[:, None]
+    offsets = offsets - (weight * offsets).sum(dim=1, keepdim=True)
+    x, y, z = offsets.unbind(-1)
     products = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
-    covariance = torch.stack([(a * b).sum(dim=1) for a, b in products], dim=1) / count.clamp_min(1)
-    return torch.where(count >= 3, smallest_eigenvector(covariance), draws.direction(len(points)))
+    covariance = torch.stack([(weight[..., 0] * a * b).sum(dim=1) for a, b in products], dim=1)
+    return torch.where(
+        near.sum(dim=1, keepdim=True) >= 3, smallest_eigenvector(covariance), draws.direction(len(points))
+    )
 
 
 def smallest_eigenvector(matrices: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from utopic_cli.frame import DENSE_RATIO
 from utopic_cli.model.cloud_input import CloudInput
-from utopic_cli.preprocess import PATCHES
+from utopic_cli.preprocess import NORMAL_SOFTNESS, PATCHES
 from utopic_cli.training.batched.draws import Draws, unit
 from utopic_cli.training.batched.normals import NEIGHBOURS, faced, guessed_signs, plane_normals
 from utopic_cli.training.batched.ragged import (
@@ -28,7 +28,7 @@ from utopic_cli.training.batched.ragged import (
 from utopic_cli.training.batched.raw_pairs import RawPairs
 from utopic_cli.training.batched.voxels import Voxels, common_spacing, near, rows_of, voxelised
 
-NORMAL_REACH = 3.0  # in cells of the dense cloud
+NORMAL_REACH = 6.0  # in cells of the dense cloud: of sparse clouds, too, 30 neighbours are nearer
 KNOWN_SIDE = 0.5
 """Share of pairs whose normals face the scanner where it is known; see ``training.data.sample_pair``."""
 
@@ -108,7 +108,9 @@ def dense_clouds(clouds: FlatClouds, points: int, draws: Draws) -> DenseClouds:
     spacing = common_spacing(clouds.points, clouds.cloud, count, points).repeat_interleave(2)
     voxels = voxelised(clouds.points, clouds.cloud, spacing / DENSE_RATIO)
     distance, index = near(voxels.means, voxels.cloud, voxels, NORMAL_REACH, NEIGHBOURS)
-    normals = plane_normals(voxels.means, distance, index, draws)
+    rows, mask = to_rows(distance[:, 1:2], voxels.cloud, count, int(torch.bincount(voxels.cloud).max()))
+    gap = masked_quantile(rows[..., 0], mask & rows[..., 0].isfinite(), 0.5)
+    normals = plane_normals(voxels.means, distance, index, NORMAL_SOFTNESS * gap[voxels.cloud], draws)
     normals = faced(normals, group_means(clouds.towards, voxels.owner, len(voxels.keys)))
     known = draws.chance(KNOWN_SIDE, count // 2).repeat_interleave(2) & clouds.one_side
     sign = guessed_signs(voxels.means, normals, distance, index, voxels.cloud, count, ~known)
