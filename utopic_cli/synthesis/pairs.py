@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from utopic_cli.synthesis.range_pairs import range_scan_pair
+from utopic_cli.synthesis.rooms import room_pair
 from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair
-from utopic_cli.synthesis.settings import PairSettings, Range
+from utopic_cli.synthesis.settings import KINDS, PairSettings, Range
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.synthesis.surface import DegenerateShape
 from utopic_cli.synthesis.surface_pairs import patch_pair, surface_pair
@@ -23,10 +24,10 @@ __all__ = [
     "patch_pair",
     "random_pair",
     "range_scan_pair",
+    "room_pair",
     "surface_pair",
 ]
 
-KINDS = ("range_scan", "independent", "shared", "patch")
 EVALUATION_BANDS: tuple[Range, ...] = ((0.1, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 1.0))
 
 
@@ -48,12 +49,14 @@ def random_pair(
     """
     settings = settings or PairSettings()
     weight = np.asarray(settings.kinds, dtype=np.float64)
-    kind = KINDS[rng.choice(len(KINDS), p=weight / weight.sum())]
+    kind = KINDS[rng.choice(len(weight), p=weight / weight.sum())]
     band = settings.bands[rng.integers(len(settings.bands))]
     reason: DegenerateShape | None = None
     for _ in range(settings.attempts):
-        mesh = library.mesh(library.draw(rng))
         try:
+            if kind == "room":
+                return room_pair(library, rng, settings)
+            mesh = library.mesh(library.draw(rng))
             if kind == "range_scan":
                 return range_scan_pair(mesh, rng, settings, band)
             if kind == "patch":

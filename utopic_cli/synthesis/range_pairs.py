@@ -11,10 +11,15 @@ from utopic_cli.geometry.rigid import random_rotation
 from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair, check_cloud, posed_pair
 from utopic_cli.synthesis.scanner import DepthMap, depth_map, ray_noise
 from utopic_cli.synthesis.settings import PairSettings, Range
-from utopic_cli.synthesis.surface import bounding_diagonal, face_areas, face_normals, normalised, sample_faces
+from utopic_cli.synthesis.surface import (
+    Mesh,
+    bounding_diagonal,
+    face_areas,
+    face_normals,
+    normalised,
+    sample_faces,
+)
 from utopic_cli.synthesis.warp import SmoothWarp, compacting_stretch, random_stretch, random_warp
-
-Mesh = tuple[np.ndarray, np.ndarray]
 
 CELLS_ACROSS = 170  # grid cells to one extent: about 100 to 130 across an object as seen
 SAMPLES_PER_CELL = 3.0  # of a surface seen straight on; fewer would leave holes in its front

@@ -33,7 +33,7 @@ class ScanPair:
         source_viewpoint: (3,) unit direction towards a scanner far away, in the source's
             frame; None if the cloud was not seen from one side.
         target_viewpoint: (3,) the same of the target, in the target's frame.
-        kind: range_scan, independent, shared or patch.
+        kind: range_scan, independent, shared, patch or room.
         extent: diagonal of the bounding box of the whole object, in the points' unit.
         object_points: (P, 3) sample of the whole object in the source's frame, where it was asked for.
         shared: (K, 2) int64, row (i, j) where source point i and target point j are one point of

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from utopic_cli.errors import InputError
+
 Range = tuple[float, float]
+
+KINDS = ("range_scan", "independent", "shared", "patch", "room")
+"""The recipes of pairs, in the order of ``PairSettings.kinds``."""
 
 
 @dataclass(frozen=True)
@@ -15,7 +20,7 @@ class PairSettings:
     otherwise. A range is drawn from uniformly unless said otherwise.
 
     Attributes:
-        kinds: relative weights of range_scan, independent, shared and patch pairs.
+        kinds: relative weights of ``KINDS``, in their order; 0 for those left out at the end.
         bands: overlap bands (smaller side) that range pairs are drawn for, equally often.
         minimum_overlap: pairs below (smaller side) are never returned.
         thin_above: range pairs that come out above this overlap are kept only with
@@ -57,10 +62,11 @@ class PairSettings:
         surface_rotations: ``uniform`` over SO(3), or the paper's ``euler45``.
         patch_points: points per cloud of patch pairs, log-uniform.
         patch_keep: share of the whole surface in each patch.
+        room_points: fewest and most points per scan of room pairs, log-uniform.
         attempts: draws tried before giving up on a pair.
     """
 
-    kinds: tuple[float, float, float, float] = (0.75, 0.13, 0.05, 0.07)
+    kinds: tuple[float, ...] = (0.7, 0.13, 0.05, 0.07, 0.05)
     bands: tuple[Range, ...] = ((0.1, 0.3), (0.3, 0.5), (0.5, 0.9))
     minimum_overlap: float = 0.1
     thin_above: float = 0.7
@@ -94,4 +100,17 @@ class PairSettings:
     surface_rotations: str = "uniform"
     patch_points: tuple[int, int] = (4000, 20000)
     patch_keep: Range = (0.2, 0.5)
+    room_points: tuple[int, int] = (2000, 20000)
     attempts: int = 30
+
+    def __post_init__(self) -> None:
+        """Refuse weights that no kind can be drawn by.
+
+        Raises:
+            InputError: too many kinds, a negative weight, or none above 0.
+        """
+        fits = len(self.kinds) <= len(KINDS) and min(self.kinds, default=0) >= 0 and sum(self.kinds) > 0
+        if not fits:
+            raise InputError(
+                f"kinds is {list(self.kinds)}; give weights of {', '.join(KINDS)}, none negative, not all 0"
+            )

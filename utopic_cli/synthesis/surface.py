@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (V, 3) and faces (F, 3)."""
+
 BLOCK = 8192  # points worked on at a time, so that temporaries stay in the cache
 
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from utopic_cli.geometry.rigid import invert, rigid
 from utopic_cli.synthesis.crops import half_space_crop, nearest_crop
-from utopic_cli.synthesis.range_pairs import Mesh, warped_surface
+from utopic_cli.synthesis.range_pairs import warped_surface
 from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair, check_cloud, posed_pair
 from utopic_cli.synthesis.scanner import depth_map
 from utopic_cli.synthesis.settings import PairSettings
-from utopic_cli.synthesis.surface import bounding_diagonal, normalised, sample_surface
+from utopic_cli.synthesis.surface import Mesh, bounding_diagonal, normalised, sample_surface
 from utopic_cli.synthesis.warp import SmoothWarp
 
 OUTSIDE_SAMPLES = 30_000

@@ -9,15 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from utopic_cli.synthesis.pairs import KINDS
+from utopic_cli.synthesis.rooms import furnished_room
 from utopic_cli.synthesis.scan_pair import DegeneratePair
-from utopic_cli.synthesis.settings import PairSettings
-from utopic_cli.synthesis.shapes import ShapeLibrary
+from utopic_cli.synthesis.settings import KINDS, PairSettings
+from utopic_cli.synthesis.shapes import ShapeLibrary, pack
 from utopic_cli.training.batched.draws import Draws
 from utopic_cli.training.batched.hypotheses import draw_hypotheses
 from utopic_cli.training.batched.meshes import Meshes
 from utopic_cli.training.batched.range_pairs import range_scan_pairs
 from utopic_cli.training.batched.raw_pairs import RawPairs, joined
+from utopic_cli.training.batched.room_pairs import room_pairs
 from utopic_cli.training.batched.sampling import dense_clouds, moved_apart, of_side, sampled
 from utopic_cli.training.batched.surface_pairs import patch_pairs, surface_pairs
 from utopic_cli.training.data import BatchOrder, points_of
@@ -29,14 +30,17 @@ TOGETHER = 64
 MOST_TIMES = 4
 """Tries at once of a pair that failed before."""
 
-RANGE_SCAN, INDEPENDENT, SHARED, PATCH = range(len(KINDS))
+RANGE_SCAN, INDEPENDENT, SHARED, PATCH, ROOM = range(len(KINDS))
+
+ROOMS = 300
+"""Furnished rooms made before the first batch; every pair has views and noise of its own."""
 
 
 class Orders(NamedTuple):
     """What pairs are to be like. The kind and the band of a pair stay, however often it is tried.
 
     Attributes:
-        kind: (B,) int64 number in ``synthesis.pairs.KINDS``.
+        kind: (B,) int64 number in ``synthesis.settings.KINDS``.
         band: (B, 2) overlap a range-scan pair is to have.
     """
 
@@ -80,6 +84,8 @@ class BatchedPairs:
         """
         self.settings, self.device, self.neighbours = settings, device, neighbours
         self.meshes = Meshes(library, device)
+        with_rooms = len(settings.kinds) > ROOM and settings.kinds[ROOM] > 0
+        self.rooms = Meshes(furnished_rooms(library, ROOMS), device) if with_rooms else None
 
     @torch.no_grad()
     def make(self, count: int, points: int, generator: torch.Generator) -> TrainingPair:
@@ -141,6 +147,7 @@ class BatchedPairs:
             (orders.kind == RANGE_SCAN, self._range_scans),
             ((orders.kind == INDEPENDENT) | (orders.kind == SHARED), self._crops),
             (orders.kind == PATCH, self._patches),
+            (orders.kind == ROOM, self._rooms),
         )
         made, place = [], []
         for chosen, recipe in recipes:
@@ -161,3 +168,16 @@ class BatchedPairs:
     def _patches(self, orders: Orders, draws: Draws) -> RawPairs:
         meshes = self.meshes.batch(self.meshes.draw(len(orders.kind), draws))
         return patch_pairs(meshes, draws, self.settings)
+
+    def _rooms(self, orders: Orders, draws: Draws) -> RawPairs:
+        assert self.rooms is not None  # rooms are only drawn where they have a weight
+        meshes = self.rooms.batch(self.rooms.draw(len(orders.kind), draws))
+        return room_pairs(meshes, draws, self.settings)
+
+
+def furnished_rooms(library: ShapeLibrary, count: int) -> ShapeLibrary:
+    """Furnish ``count`` rooms with shapes of a library; the same library gives the same rooms."""
+    rng = np.random.default_rng(0)
+    rooms = [furnished_room(rng, library).mesh for _ in range(count)]
+    names = [f"room/{number:04d}" for number in range(count)]
+    return pack(rooms, names, ["train"] * count, ["room"] * count)
