@@ -14,12 +14,14 @@ from utopic_cli.benchmark.protocols import (
     SCAN_REACH,
     CropProtocol,
     RangeProtocol,
+    RoomProtocol,
 )
 from utopic_cli.errors import UsageError
 from utopic_cli.geometry.rigid import apply
 from utopic_cli.synthesis.pairs import evaluation_pairs
 from utopic_cli.synthesis.procedural import procedural_mesh
 from utopic_cli.synthesis.scan_pair import DegeneratePair
+from utopic_cli.synthesis.settings import PairSettings
 from utopic_cli.synthesis.shapes import ShapeLibrary, pack
 from utopic_cli.training.labels import POSITIVE_REACH
 
@@ -90,6 +92,19 @@ def test_range_scans_lie_in_their_bands_in_equal_numbers(shapes: ShapeLibrary) -
         np.testing.assert_array_equal(pair.source.points, same.source.points)
         assert pair.object_points is not None and len(pair.object_points) >= 20_000
         assert protocol.unit(pair) == pair.extent
+
+
+def test_rooms_overlap_enough_and_bring_the_whole_room(shapes: ShapeLibrary) -> None:
+    protocol = RoomProtocol(least_overlap=0.5)
+    for number in range(3):
+        pair = protocol.pair(shapes, 2, number)
+        assert pair.kind == "room" and pair.smaller_overlap >= 0.5
+        assert pair.object_points is not None and len(pair.object_points) >= 20_000
+        found = cKDTree(pair.object_points).query(pair.source.points)[0]
+        assert np.quantile(found, 0.9) < 0.02 * pair.extent
+        assert protocol.unit(pair) == pair.extent and protocol.group(number) == "rooms"
+    with pytest.raises(DegeneratePair, match="no usable room in 30 draws"):
+        RoomProtocol(pairs=PairSettings(room_points=(300_000, 400_000))).pair(shapes, 0, 0)
 
 
 def test_overlap_means_the_same_as_in_training() -> None:

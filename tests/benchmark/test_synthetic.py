@@ -16,7 +16,7 @@ from utopic_cli.benchmark.curves import PARAMETERS, CurveProtocol, SweepProtocol
 from utopic_cli.benchmark.fpfh import Fpfh
 from utopic_cli.benchmark.held_out import held_out
 from utopic_cli.benchmark.method import Trial
-from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
+from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol, RoomProtocol
 from utopic_cli.benchmark.reports import render
 from utopic_cli.benchmark.result_page import page
 from utopic_cli.benchmark.synthetic import Report, run
@@ -145,6 +145,13 @@ def test_a_tiny_run_gives_the_same_for_any_number_of_workers(shapes: ShapeLibrar
 
 def test_a_tiny_run_on_range_scans(shapes: ShapeLibrary) -> None:
     check_report(run(SCANS, shapes, "tiny", **OPTIONS), SCANS)
+
+
+def test_a_tiny_run_on_rooms(shapes: ShapeLibrary) -> None:
+    rooms = RoomProtocol(pairs=replace(PairSettings(), room_points=(2000, 3000)))
+    report = run(rooms, shapes, "tiny", **{**OPTIONS, "pairs": 1, "workers": 1})
+    assert [(answer.group, answer.shape) for answer in report.answers] == [("rooms", "room")] * 2
+    assert "lengths in: extent of the scene" in " ".join(printed(report).split())
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from utopic_cli.benchmark import synthetic
-from utopic_cli.benchmark.protocols import CropProtocol, RangeProtocol
+from utopic_cli.benchmark.protocols import CropProtocol, RangeProtocol, RoomProtocol
 from utopic_cli.benchmark.scans import Report
 from utopic_cli.commands.bench import PANELS
 from utopic_cli.config import AlignOptions
@@ -92,6 +92,7 @@ def synthetic_run(monkeypatch):
         (["detail", "--relief"], CropProtocol("detail", 0.7, "shared", "euler45", 5000, 0.04)),
         (["scanobjectnn"], CropProtocol("scanobjectnn", 0.7, "shared", "euler45")),
         (["range-scans"], RangeProtocol()),
+        (["rooms"], RoomProtocol()),
     ],
 )
 def test_each_protocol_is_a_command(cli, synthetic_run, tmp_path, arguments, protocol):

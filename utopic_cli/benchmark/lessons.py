@@ -34,7 +34,7 @@ MIXTURE: tuple[tuple[float, AnyProtocol], ...] = (
     (
         0.10,
         RangeProtocol(
-            ((0.15, 0.6),), replace(PairSettings(), several_views_probability=1.0), "several views"
+            replace(PairSettings(), several_views_probability=1.0), ((0.15, 0.6),), "several views"
         ),
     ),
 )

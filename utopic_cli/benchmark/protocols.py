@@ -13,7 +13,7 @@ import numpy as np
 
 from utopic_cli.errors import UsageError
 from utopic_cli.preprocess import PreparedPair
-from utopic_cli.synthesis.pairs import PairSettings, ScanPair, evaluation_pair, surface_pair
+from utopic_cli.synthesis.pairs import PairSettings, ScanPair, evaluation_pair, room_pair, surface_pair
 from utopic_cli.synthesis.scan_pair import DegeneratePair
 from utopic_cli.synthesis.settings import Range
 from utopic_cli.synthesis.shapes import ShapeLibrary
@@ -199,26 +199,14 @@ class CropProtocol:
 
 
 @dataclass(frozen=True)
-class RangeProtocol:
-    """``range-scans``: virtual range scans of whole objects from two sides, in random poses.
-
-    The pairs of ``synthesis.pairs.evaluation_pairs``: dense, noisy, with holes and outliers as in
-    training, rotations uniform over SO(3); the overlap bands take turns.
+class SceneProtocol:
+    """What protocols of dense scans in any pose have in common: errors are counted in extents of the scene.
 
     Attributes:
-        bands: overlap of the smaller side, at least the first number, less than the second.
         pairs: what the scans are like; the training mixture's if not given.
-        name: of the protocol.
     """
 
-    bands: tuple[Range, ...] = SCAN_BANDS
     pairs: PairSettings = field(default_factory=PairSettings)
-    name: str = "range-scans"
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """What the table's rows are grouped by."""
-        return tuple(f"{low:g}-{high:g}" for low, high in self.bands)
 
     @property
     def cleans(self) -> bool:
@@ -228,25 +216,15 @@ class RangeProtocol:
     def settings(self) -> dict[str, Any]:
         """Return the definition, JSON-ready."""
         return {
-            "name": self.name,
-            "bands": [list(band) for band in self.bands],
-            "pairs": asdict(self.pairs),
+            **asdict(self),
             "overlap_reach_in_spacings": SCAN_REACH,
             "inlier_reach_in_spacings": SCAN_INLIER,
-            "length_unit": "extent of the object",
+            "length_unit": "extent of the scene",
             "translation_error": "at the source's centroid",
         }
 
-    def pair(self, library: ShapeLibrary, seed: int, number: int) -> ScanPair:
-        """Make pair ``number`` of the test set ``seed``.
-
-        Raises:
-            DegeneratePair: the shapes have no such pair of views.
-        """
-        return evaluation_pair(library, seed, number, self.bands, self.pairs, whole=True)
-
     def unit(self, pair: ScanPair) -> float:
-        """Length that errors are counted in: the object's extent."""
+        """Length that errors are counted in: the extent of the whole object or room."""
         return pair.extent
 
     def centre(self, pair: ScanPair) -> np.ndarray | None:
@@ -261,6 +239,73 @@ class RangeProtocol:
         """Within which a match is an inlier, normalised units."""
         return SCAN_INLIER * prepared.spacing
 
+
+@dataclass(frozen=True)
+class RangeProtocol(SceneProtocol):
+    """``range-scans``: virtual range scans of whole objects from two sides, in random poses.
+
+    The pairs of ``synthesis.pairs.evaluation_pairs``: dense, noisy, with holes and outliers as in
+    training, rotations uniform over SO(3); the overlap bands take turns.
+
+    Attributes:
+        bands: overlap of the smaller side, at least the first number, less than the second.
+        name: of the protocol.
+    """
+
+    bands: tuple[Range, ...] = SCAN_BANDS
+    name: str = "range-scans"
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """What the table's rows are grouped by."""
+        return tuple(f"{low:g}-{high:g}" for low, high in self.bands)
+
+    def pair(self, library: ShapeLibrary, seed: int, number: int) -> ScanPair:
+        """Make pair ``number`` of the test set ``seed``.
+
+        Raises:
+            DegeneratePair: the shapes have no such pair of views.
+        """
+        return evaluation_pair(library, seed, number, self.bands, self.pairs, whole=True)
+
     def group(self, number: int) -> str:
         """Name the group of a pair."""
         return self.groups[number % len(self.groups)]
+
+
+@dataclass(frozen=True)
+class RoomProtocol(SceneProtocol):
+    """``rooms``: panoramic scans from two places in a room furnished with the shapes, in random poses.
+
+    Attributes:
+        least_overlap: of the smaller side.
+        name: of the protocol.
+    """
+
+    least_overlap: float = 0.15
+    name: str = "rooms"
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """What the table's rows are grouped by."""
+        return ("rooms",)
+
+    def pair(self, library: ShapeLibrary, seed: int, number: int) -> ScanPair:
+        """Make pair ``number`` of the test set ``seed``.
+
+        Raises:
+            DegeneratePair: no usable pair in many draws.
+        """
+        rng = np.random.default_rng([seed, number])
+        wanted = replace(self.pairs, minimum_overlap=self.least_overlap)
+        reason: DegenerateShape | None = None
+        for _ in range(ATTEMPTS):
+            try:
+                return replace(room_pair(library, rng, wanted, whole=True), shape="room")
+            except DegenerateShape as error:
+                reason = error
+        raise DegeneratePair(f"no usable room in {ATTEMPTS} draws; the last: {reason}")
+
+    def group(self, number: int) -> str:
+        """Name the group of a pair."""
+        return self.groups[0]

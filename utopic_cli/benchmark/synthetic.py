@@ -1,4 +1,4 @@
-"""Protocols on synthetic pairs: ``modelnet``, ``modelonet``, ``range-scans``, and the curves.
+"""Protocols on synthetic pairs: ``modelnet``, ``modelonet``, ``range-scans``, ``rooms``, and the curves.
 
 Definitions: ``protocols``, ``curves``. Everybody meets the same pairs in the same run. The matches of
 networks and hand-made features go into the same robust solve; whole methods answer by themselves. Each

@@ -34,7 +34,7 @@ from utopic_cli.config import AlignOptions
 bench = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
 PANELS = {
-    "What to expect": ("scans", "range-scans", "confidence", "batch", "speed"),
+    "What to expect": ("scans", "range-scans", "rooms", "confidence", "batch", "speed"),
     "The paper's pairs": ("modelnet", "modelonet", "scanobjectnn", "detail", "overlap-sweep"),
     "Robustness": ("noise", "density", "outliers", "rotation"),
     "The paper's variants, trained": ("ablation", "attention", "uncertainty"),

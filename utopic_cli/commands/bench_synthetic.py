@@ -121,6 +121,21 @@ def range_scans(asked: Asked, data: Data = "procedural") -> None:
 
 
 @with_shared_options
+def rooms(asked: Asked, data: Data = "procedural") -> None:
+    """Panoramic scans from two places in a room furnished with the shapes, in random poses.
+
+    Example: [bold]utopic bench rooms --data furniture/ --baselines fpfh[/bold]
+    """
+
+    def protocol() -> AnyProtocol:
+        from utopic_cli.benchmark.protocols import RoomProtocol
+
+        return RoomProtocol()
+
+    measure(asked, data, protocol)
+
+
+@with_shared_options
 def overlap_sweep(
     asked: Asked, data: Data = "procedural", sampling: Sampling = "shared", rotations: Rotations = None
 ) -> None:
@@ -162,6 +177,7 @@ def mount(bench: typer.Typer) -> None:
         ("scanobjectnn", scanobjectnn),
         ("detail", detail),
         ("range-scans", range_scans),
+        ("rooms", rooms),
         ("overlap-sweep", overlap_sweep),
         *((name, curve_command(name)) for name in CURVES),
     ):

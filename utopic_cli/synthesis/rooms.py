@@ -35,13 +35,16 @@ class Room:
     halves: np.ndarray
 
 
-def room_pair(library: ShapeLibrary, rng: np.random.Generator, settings: PairSettings) -> ScanPair:
+def room_pair(
+    library: ShapeLibrary, rng: np.random.Generator, settings: PairSettings, *, whole: bool = False
+) -> ScanPair:
     """Scan a room furnished with boxes, cylinders and shapes of the library from two places.
 
     Args:
         library: the meshes.
         rng: source of randomness.
         settings: ``room_points``, ``translation`` and ``minimum_overlap``.
+        whole: let a sample of the whole room travel with the pair.
 
     Raises:
         DegeneratePair: the scans overlap too little, or have too few points.
@@ -52,6 +55,7 @@ def room_pair(library: ShapeLibrary, rng: np.random.Generator, settings: PairSet
         points=settings.room_points,
         least_overlap=settings.minimum_overlap,
         translation=settings.translation,
+        whole=whole,
     )
 
 
@@ -94,6 +98,7 @@ def scanned_twice(
     points: tuple[int, int],
     least_overlap: float,
     translation: float = 1.0,
+    whole: bool = False,
 ) -> ScanPair:
     """Scan a room all round from two places, some of the scans cut to a sector.
 
@@ -103,13 +108,15 @@ def scanned_twice(
         points: fewest and most points of a scan, log-uniform.
         least_overlap: of the side that has less of it.
         translation: each scan is moved by up to this much along each axis (times the extent).
+        whole: let a sample of the whole room travel with the pair.
 
     Raises:
         DegeneratePair: the scans overlap too little, or have too few points.
     """
     extent = bounding_diagonal(room.mesh[0])
     source, target = (_scanned(room, extent, rng, points) for _ in range(2))
-    pair = posed_pair(source, target, "room", extent, rng, translation=translation)
+    everything = sample_surface(*room.mesh, SAMPLES, rng.spawn(1)[0])[0] if whole else None
+    pair = posed_pair(source, target, "room", extent, rng, translation=translation, whole=everything)
     if pair.smaller_overlap < least_overlap:
         raise DegeneratePair(f"overlap {pair.smaller_overlap:.2f} is under {least_overlap:g}")
     return pair
