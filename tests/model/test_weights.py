@@ -10,6 +10,7 @@ import torch
 from tests.model.conftest import SMALL
 from utopic_cli.config import ModelConfig
 from utopic_cli.errors import InputError
+from utopic_cli.model.bundled import bundled_weights
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import choose_device, find_weights, load_weights, pack_weights
 
@@ -70,6 +71,18 @@ def test_a_missing_card_file_or_name_is_named(saved, tmp_path):
         load_weights(str(tmp_path / "absent.safetensors"))
     with pytest.raises(InputError, match="no bundled weights of that name"):
         find_weights("absent")
+
+
+@pytest.mark.parametrize("name", sorted(bundled_weights()))
+def test_bundled_weights_say_what_they_are_for_and_where_they_come_from(name):
+    model, card = load_weights(name)
+    assert card["name"] == name and card["licence"] == "Apache-2.0" and card["purpose"]
+    assert card["pairs_seen"] == sum(run["pairs"] for run in card["runs"])
+    assert card["data"]["shapes"] == 2910 and 0 < card["validation"]["hit_rate"] < 1
+    assert all({"seed", "joint_pairs"} <= set(run["training"]["schedule"]) for run in card["runs"])
+    assert find_weights(name).stat().st_size < 20e6
+    assert ("calibration" in card) == (name == "utopic")
+    assert model.verifier is not None
 
 
 def test_devices_are_checked():

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from utopic_cli.commands.console import Console, Debug
+from utopic_cli.commands.console import DEFAULTS, Console, Debug
 
 REQUIRED = ("torch", "numpy", "scipy", "safetensors", "trimesh", "typer", "rich")
 OPTIONAL = {
@@ -143,8 +143,11 @@ def _weights(more: Sequence[str]) -> dict[str, Any]:
     from utopic_cli.model.bundled import bundled_weights
     from utopic_cli.model.weights import find_weights, read_card
 
+    bundled = sorted(
+        bundled_weights().items(), key=lambda one: one[0] != DEFAULTS.weights
+    )  # what is used first
     found: dict[str, Any] = {}
-    for name, path in {**bundled_weights(), **{one: find_weights(one) for one in more}}.items():
+    for name, path in (dict(bundled) | {one: find_weights(one) for one in more}).items():
         facts: dict[str, Any] = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         try:
             card = read_card(path)
