@@ -143,9 +143,8 @@ def _weights(more: Sequence[str]) -> dict[str, Any]:
     from utopic_cli.model.bundled import bundled_weights
     from utopic_cli.model.weights import find_weights, read_card
 
-    bundled = sorted(
-        bundled_weights().items(), key=lambda one: one[0] != DEFAULTS.weights
-    )  # what is used first
+    # What is used where nothing is said comes first.
+    bundled = sorted(bundled_weights().items(), key=lambda one: one[0] != DEFAULTS.weights)
     found: dict[str, Any] = {}
     for name, path in (dict(bundled) | {one: find_weights(one) for one in more}).items():
         facts: dict[str, Any] = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}

@@ -139,7 +139,7 @@ class BatchedPairs:
         kind = torch.searchsorted(weight / weight[-1], draws.uniform(count), right=True)
         bands = torch.tensor(self.settings.bands, device=draws.device)
         which = draws.below(torch.tensor(len(bands), device=draws.device), count)
-        return Orders(kind.clamp_max(len(KINDS) - 1), bands[which])
+        return Orders(kind.clamp_max(len(weight) - 1), bands[which])
 
     def attempt(self, orders: Orders, draws: Draws) -> RawPairs:
         """Try to make each pair once; ``good`` tells where it succeeded."""
