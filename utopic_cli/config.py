@@ -9,7 +9,7 @@ from utopic_cli.errors import InputError
 
 INPUT_FEATURES = ("invariant", "coordinates")
 POSITIONAL_SCHEMES = ("vanilla", "absolute", "learned", "geometric")
-UNCERTAINTY_SCHEMES = ("sampled", "predicted", "none")
+UNCERTAINTY_SCHEMES = ("matched", "sampled", "predicted", "none")
 NORMALISATIONS = ("layer", "batch")
 SOLVERS = ("auto", "svd", "consensus")
 DEVICES = ("auto", "cpu", "cuda", "mps")
@@ -27,7 +27,8 @@ class ModelConfig:
     The paper's own setting is ``input_features="coordinates"``, ``layers=3``, ``heads=4``,
     ``transformer_width=256``, ``feature_width=512``, ``channels=(64, 64, 128, 256)``,
     ``adaptive_hidden=64``, ``kernel_rank=0``, ``neighbours=20``, ``normalisation="batch"``,
-    ``sinkhorn_iterations=20``, ``descriptor_skip=False``, ``hypothesis=False``.
+    ``sinkhorn_iterations=20``, ``descriptor_skip=False``, ``hypothesis=False``,
+    ``uncertainty_scheme="sampled"``.
 
     Attributes:
         input_features: ``invariant`` (local geometry of the dense scan, the same in any
@@ -43,7 +44,8 @@ class ModelConfig:
         heads: attention heads.
         layers: how often (self, cross) attention repeats in each geometry transformer.
         positional_scheme: vanilla, absolute, learned or geometric self-attention.
-        uncertainty_scheme: ``sampled`` (Eq. 8), ``predicted`` variance, or ``none``.
+        uncertainty_scheme: ``matched`` (variance told from the first correspondences), ``sampled`` (the
+            paper's, from features), ``predicted`` or ``none``.
         overlap: whether overlap heads weight the correspondences (ablation O).
         uncertainty_samples: K of the overlap distribution.
         sinkhorn_iterations: rounds of row and column normalisation.
@@ -64,7 +66,7 @@ class ModelConfig:
     heads: int = 4
     layers: int = 2
     positional_scheme: str = "geometric"
-    uncertainty_scheme: str = "sampled"
+    uncertainty_scheme: str = "matched"
     overlap: bool = True
     uncertainty_samples: int = 50
     sinkhorn_iterations: int = 5

@@ -26,6 +26,7 @@ def build(**changes: object) -> Utopic:
         {"positional_scheme": "vanilla"},
         {"positional_scheme": "absolute"},
         {"positional_scheme": "learned"},
+        {"uncertainty_scheme": "sampled"},
         {"uncertainty_scheme": "predicted"},
         {"uncertainty_scheme": "none"},
         {"normalisation": "batch"},
@@ -114,8 +115,9 @@ def test_a_filled_up_batch_gives_what_each_pair_gives_alone():
                 torch.testing.assert_close(filled[-1, :m], expected[-1, :m], atol=1e-5, rtol=1e-4)
 
 
-def test_the_same_generator_gives_the_same_numbers_and_another_does_not():
-    model = build()
+@pytest.mark.parametrize("scheme", ["sampled", "matched"])
+def test_the_same_generator_gives_the_same_numbers_and_another_only_where_samples_count(scheme):
+    model = build(uncertainty_scheme=scheme)
     source, target = (cloud_input(bumpy_points(100, seed), model.config) for seed in (0, 1))
     with torch.no_grad():
         runs = [
@@ -123,7 +125,7 @@ def test_the_same_generator_gives_the_same_numbers_and_another_does_not():
             for seed in (3, 3, 4)
         ]
     assert torch.equal(runs[0], runs[1])
-    assert not torch.equal(runs[0], runs[2])
+    assert torch.equal(runs[0], runs[2]) == (scheme == "matched")
 
 
 def test_random_masking_hides_features_only_when_asked_for():

@@ -197,11 +197,10 @@ def test_a_loss_is_a_mean_over_pairs():
 
 
 def spread_out(variances: list[float]) -> OverlapDistribution:
-    """Two samples a point, that far apart."""
-    deviation = torch.tensor([variances]).sqrt()
-    samples = torch.stack([0.5 - deviation, 0.5 + deviation], dim=1)
-    nothing = torch.zeros_like(deviation)
-    return OverlapDistribution(nothing, nothing, samples, nothing)
+    """Points of such raw uncertainty."""
+    raw = torch.tensor([variances])
+    nothing = torch.zeros_like(raw)
+    return OverlapDistribution(nothing, nothing, nothing[:, None], raw)
 
 
 def test_reliability_loss_reads_the_variance_as_odds_of_a_wrong_match():
@@ -223,7 +222,7 @@ def test_reliability_loss_moves_the_variance_of_a_wrong_point_up():
     mean, log_variance = torch.zeros(1, 1), torch.full((1, 1), -2.0, requires_grad=True)
     noise = torch.randn(1, 50, 1, generator=torch.Generator().manual_seed(0))
     samples = torch.sigmoid(mean[:, None] + noise * (0.5 * log_variance).exp()[:, None])
-    distribution = OverlapDistribution(mean, log_variance, samples, samples.var(dim=1))
+    distribution = OverlapDistribution(mean, log_variance, samples, samples.var(dim=1, unbiased=False))
     scores, near = torch.tensor([[[0.9, 0.1]]]), torch.tensor([[[False, True]]])
     reliability_loss(distribution, scores, near, torch.ones(1, 1), torch.ones(1, 1)).backward()
     assert float(log_variance.grad) < 0

@@ -17,7 +17,7 @@ class OverlapDistribution(NamedTuple):
         mean: (B, N) mu, in logits.
         log_variance: (B, N) log sigma^2, in logits squared.
         samples: (B, K, N) overlap scores in [0, 1].
-        raw_uncertainty: (B, N) variance of the samples, not normalised.
+        raw_uncertainty: (B, N) variance, not normalised; of what, the scheme says.
     """
 
     mean: Tensor
@@ -26,15 +26,28 @@ class OverlapDistribution(NamedTuple):
     raw_uncertainty: Tensor
 
 
+LEAST_PEAK = 1e-3
+"""A first correspondence weaker than this is as good as none."""
+
+
 class UncertaintyQuantification(nn.Module):
-    """Predict a Gaussian overlap per point, draw from it, take the variance (Eq. 8)."""
+    """Predict a Gaussian overlap per point, draw from it, take the variance (Eq. 8).
+
+    What the variance is of, and what it is predicted from, depends on the scheme. ``sampled``: both moments
+    from the features; the variance of samples squeezed into [0, 1]. ``predicted``: the predicted deviation
+    itself. ``none``: nothing is uncertain. ``matched``: the variance is predicted from how sharply the point
+    is matched at first, and from a hypothesis' evidence; squeezed are the samples' distances from the mean,
+    since at a mean that is sure there is little room for any variance. Only ``reliability_loss`` teaches it.
+    From the features it can't be told: they know which surface is plain, and that plain surface (a wall) is
+    sure to overlap, not whether the point can be told from its neighbours.
+    """
 
     def __init__(self, width: int, scheme: str, samples: int, evidence: int = 0) -> None:
         """Build.
 
         Args:
             width: channels of the features.
-            scheme: ``sampled``, ``predicted`` or ``none`` (which still predicts the mean).
+            scheme: ``matched``, ``sampled``, ``predicted`` or ``none`` (which still predicts the mean).
             samples: K.
             evidence: channels of a hypothesis' evidence, which reaches mean and log-variance
                 directly; 0 without hypotheses.
@@ -42,24 +55,33 @@ class UncertaintyQuantification(nn.Module):
         super().__init__()
         self.scheme, self.samples = scheme, samples
         self.mean = nn.Linear(width, 1)
-        self.log_variance = nn.Linear(width, 1)
+        self.log_variance = nn.Linear(1 if scheme == "matched" else width, 1)
         if evidence:
             self.evidence = nn.Linear(evidence, 2, bias=False)
             nn.init.zeros_(self.evidence.weight)
 
     @one_thread()
     def forward(
-        self, features: Tensor, generator: torch.Generator, evidence: Tensor | None = None
+        self,
+        features: Tensor,
+        peak: Tensor,
+        generator: torch.Generator,
+        evidence: Tensor | None = None,
     ) -> OverlapDistribution:
         """Quantify overlap.
 
         Args:
             features: (B, N, V).
+            peak: (B, N) largest soft correspondence of each point, in [0, 1].
             generator: draws the K samples, on the CPU.
             evidence: (B, N, E) of a hypothesis, or None.
         """
         mean = self.mean(features).squeeze(-1).float()
-        log_variance = self.log_variance(features).squeeze(-1).float()
+        if self.scheme == "matched":
+            known = peak.detach().float().clamp_min(LEAST_PEAK).log()[..., None]
+        else:
+            known = features
+        log_variance = self.log_variance(known).squeeze(-1).float()
         if evidence is not None:
             shift = self.evidence(evidence).float()
             mean, log_variance = mean + shift[..., 0], log_variance + shift[..., 1]
@@ -69,12 +91,24 @@ class UncertaintyQuantification(nn.Module):
         shape = (mean.shape[0], self.samples, mean.shape[1] if self.training else 1)
         noise = torch.randn(shape, generator=generator).to(mean.device)
         deviation = (0.5 * log_variance).exp()
+        if self.scheme == "matched":
+            raw = self._spread(deviation)
+            # What the samples teach is the mean's alone.
+            log_variance, deviation = log_variance.detach(), deviation.detach()
         samples = torch.sigmoid(mean[:, None] + noise * deviation[:, None])
-        if self.scheme == "none":  # nothing has taught the deviation anything
+        if self.scheme == "sampled":
+            raw = samples.var(dim=1, unbiased=False)
+        elif self.scheme == "predicted":
+            raw = deviation
+        elif self.scheme == "none":  # nothing has taught the deviation anything
             raw = torch.zeros_like(mean)
-        else:
-            raw = deviation if self.scheme == "predicted" else samples.var(dim=1, unbiased=False)
         return OverlapDistribution(mean, log_variance, samples, raw)
+
+    def _spread(self, deviation: Tensor) -> Tensor:
+        """Variance of K squeezed samples about a mean of 0, taken at even quantiles -> (B, N)."""
+        steps = torch.arange(self.samples, dtype=torch.float32, device=deviation.device)
+        noise = torch.special.ndtri((steps + 0.5) / self.samples)
+        return torch.sigmoid(noise[:, None] * deviation[:, None]).var(dim=1, unbiased=False)
 
 
 def normalise_uncertainty(

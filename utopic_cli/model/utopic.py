@@ -174,8 +174,13 @@ class Utopic(nn.Module):
             target_known = target_features + self.hypothesis(target_evidence)
         source_hybrid, target_hybrid = self.first_transformer(source_known, target_known, *where)
         coarse = self.first_matching(source_hybrid, target_hybrid, similarity, real)
-        source_distribution = self.quantification(source_hybrid, generator, source_evidence)
-        target_distribution = self.quantification(target_hybrid, generator, target_evidence)
+        scores = coarse[:, :-1, :-1]
+        source_distribution = self.quantification(
+            source_hybrid, scores.max(dim=2).values, generator, source_evidence
+        )
+        target_distribution = self.quantification(
+            target_hybrid, scores.max(dim=1).values, generator, target_evidence
+        )
         source_uncertainty, target_uncertainty = normalise_uncertainty(
             source_distribution.raw_uncertainty, target_distribution.raw_uncertainty, valid
         )
@@ -185,7 +190,6 @@ class Utopic(nn.Module):
         if masking and weighs:
             source_keep = source_uncertainty <= _uniform(source_uncertainty, generator)
             target_keep = target_uncertainty <= _uniform(target_uncertainty, generator)
-        scores = coarse[:, :-1, :-1]
         source_aware = self.weighting(
             source_hybrid, target_hybrid, scores, source_uncertainty if weighs else None, source_keep
         )

@@ -92,10 +92,9 @@ def reliability_loss(
         overlap: (B, N) in {0, 1}.
         valid: (B, N) float, 0 for points that only fill a batch up.
     """
-    variance = distribution.samples.var(dim=1, unbiased=False)
     best = scores.detach().argmax(dim=2, keepdim=True)
     wrong = 1.0 - near.gather(2, best)[:, :, 0].float() * overlap
-    odds = (variance.clamp_min(1e-6) / EVEN_VARIANCE).log()
+    odds = (distribution.raw_uncertainty.clamp_min(1e-6) / EVEN_VARIANCE).log()
     terms = binary_cross_entropy_with_logits(odds, wrong, reduction="none")
     return _mean(terms, near.any(dim=2).float() * valid)
 
