@@ -4,15 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from tests.estimation.conftest import lumpy_surface
-from utopic_cli.estimation.partners import (
-    BEYOND_CHANCE,
-    approach_partners,
-    fit_partners,
-    partner_evidence,
-    partner_reach,
-)
+from utopic_cli.estimation.partners import BEYOND_CHANCE, Coincidence, fit_partners
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.estimation.refinement import refine
@@ -46,6 +41,16 @@ def shared(gt_transformation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
     return source, rigid.apply(gt_transformation, target), np.column_stack([first, second])
 
 
+def thinned_evenly(points: np.ndarray, count: int) -> np.ndarray:
+    """Farthest-point sampling."""
+    rows = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(rows) < count:
+        rows.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[rows[-1]], axis=1))
+    return points[rows]
+
+
 def nudged(T: np.ndarray, points: np.ndarray, degrees: float, shift: float) -> np.ndarray:
     centre = rigid.apply(T, points.mean(axis=0))
     turn = rigid.rotation_from_vector(np.radians(degrees) * np.array([0.6, -0.64, 0.48]))
@@ -57,15 +62,32 @@ def test_shared_points_are_told_from_samples_of_their_own(
 ) -> None:
     source, target, _ = shared
     turned = nudged(gt_transformation, source, 90.0, 0.0)
-    poses = np.stack([gt_transformation, turned])
-    at_the_truth, elsewhere = partner_evidence(source, target, poses, partner_reach(source, target))
-    assert at_the_truth > 1.5 * BEYOND_CHANCE and elsewhere < 0
-    rng = np.random.default_rng(1)
-    other = rigid.apply(gt_transformation, random_sample(1000, rng))
-    poses = np.stack(
-        [gt_transformation, approach_partners(source, other, gt_transformation, partner_reach(source, other))]
-    )
-    assert partner_evidence(source, other, poses, partner_reach(source, other)).max() < 0
+    at_the_truth, elsewhere = Coincidence(source, target).evidence(np.stack([gt_transformation, turned]))
+    assert at_the_truth > 2 * BEYOND_CHANCE and abs(elsewhere) < 0.5 * BEYOND_CHANCE
+    other = rigid.apply(gt_transformation, random_sample(1000, np.random.default_rng(1)))
+    coincidence = Coincidence(source, other)
+    poses = np.stack([nudged(gt_transformation, source, degrees, 0.0) for degrees in np.linspace(0, 20, 9)])
+    assert coincidence.evidence(poses).max() < 0.5 * BEYOND_CHANCE
+    assert not len(coincidence.meet(poses, 9)[0])
+
+
+def test_shared_points_are_told_though_the_jitter_is_as_large_as_their_distances(
+    gt_transformation: np.ndarray,
+) -> None:
+    rng = np.random.default_rng(5)
+    whole = random_sample(700, rng)
+    distance = np.median(cKDTree(whole).query(whole, k=2)[0][:, 1])
+    source, target = (whole + rng.normal(0, 0.5 * distance, whole.shape) for _ in range(2))
+    target = rigid.apply(gt_transformation, target)
+    # The nearest point of the other cloud is the partner's only half of the time.
+    nearest = cKDTree(target).query(rigid.apply(gt_transformation, source))[1]
+    assert (nearest == np.arange(700)).mean() < 0.6
+    coincidence = Coincidence(source, target)
+    assert coincidence.evidence(gt_transformation[None])[0] > BEYOND_CHANCE
+    starts = np.stack([nudged(gt_transformation, source, degrees, 0.0) for degrees in (90.0, 1.5, 40.0)])
+    found, begun = coincidence.meet(starts, 3)
+    assert begun[0] == 1
+    assert rigid.relative_rotation_error_deg(found[0], gt_transformation) < 0.5
 
 
 def test_grids_do_not_pass_for_shared_points() -> None:
@@ -76,14 +98,32 @@ def test_grids_do_not_pass_for_shared_points() -> None:
     for _ in range(5):
         turn = rigid.rotation_from_vector(np.array([0.0, 0.0, rng.uniform(0.2, 1.3)]))
         pose = rigid.rigid(turn, np.append(rng.uniform(0, 1, 2), 0.0))
-        assert partner_evidence(flat, flat, pose[None], partner_reach(flat, flat))[0] < BEYOND_CHANCE
+        assert Coincidence(flat, flat).evidence(pose[None])[0] < BEYOND_CHANCE
+
+
+def test_even_samples_of_their_own_do_not_pass_for_shared_points() -> None:
+    rng = np.random.default_rng(2)
+    sheets = [np.column_stack([rng.uniform(0, 1, (4000, 2)), np.zeros(4000)]) for _ in range(2)]
+    source, target = (thinned_evenly(sheet, 300) for sheet in sheets)
+    turns = [rigid.rotation_from_vector(np.array([0.0, 0.0, angle])) for angle in np.linspace(0.2, 1.3, 20)]
+    poses = np.stack([rigid.rigid(turn, 0.1 * rng.normal(size=3) * [1, 1, 0]) for turn in turns])
+    assert Coincidence(source, target).evidence(poses).max() < 0.5 * BEYOND_CHANCE
+    assert Coincidence(source, source + 0.001).evidence(np.eye(4)[None])[0] > 2 * BEYOND_CHANCE
+
+
+def test_few_or_doubled_points_say_nothing() -> None:
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    for cloud in (points[:8], np.repeat(points, 2, axis=0)):
+        coincidence = Coincidence(points, cloud)
+        assert coincidence.reach == 0
+        assert coincidence.evidence(np.eye(4)[None])[0] == -np.inf
 
 
 def test_nothing_near_is_no_evidence() -> None:
     points = np.random.default_rng(0).normal(size=(100, 3))
     far = rigid.rigid(np.eye(3), np.full(3, 50.0))
-    assert partner_evidence(points, points, far[None], 0.1)[0] == -np.inf
-    assert np.array_equal(approach_partners(points, points, far, 0.1), far)
+    assert Coincidence(points, points).evidence(far[None])[0] == -np.inf
+    assert not len(Coincidence(points, points).meet(far[None], 1)[0])
     assert np.array_equal(fit_partners(points, points, far, 0.1), far)
 
 
@@ -93,7 +133,7 @@ def test_the_fit_is_nearly_as_good_as_if_the_partners_were_known(
     source, target, pairs = shared
     known = weighted_procrustes(source[pairs[:, 0]], target[pairs[:, 1]], np.ones(len(pairs)))
     start = nudged(gt_transformation, source, 1.5, 0.01)
-    found = fit_partners(source, target, start, partner_reach(source, target))
+    found = fit_partners(source, target, start, Coincidence(source, target).reach)
     floor = rigid.relative_rotation_error_deg(known, gt_transformation)
     assert rigid.relative_rotation_error_deg(found, gt_transformation) < 1.3 * floor + 0.1
     assert rigid.relative_rotation_error_deg(found, known) < 0.25
@@ -104,7 +144,7 @@ def test_exact_copies_are_aligned_exactly(gt_transformation: np.ndarray) -> None
     source = random_sample(300, np.random.default_rng(2))
     target = rigid.apply(gt_transformation, source)[::-1]
     found = fit_partners(
-        source, target, nudged(gt_transformation, source, 1.0, 0.005), partner_reach(source, target)
+        source, target, nudged(gt_transformation, source, 1.0, 0.005), Coincidence(source, target).reach
     )
     assert np.abs(found - gt_transformation).max() < 1e-6
 

@@ -8,13 +8,7 @@ import numpy as np
 
 from utopic_cli.estimation.consensus import Hypothesis, distinct
 from utopic_cli.estimation.meeting import Meeting, meet, self_agreement
-from utopic_cli.estimation.partners import (
-    BEYOND_CHANCE,
-    approach_partners,
-    fit_partners,
-    partner_evidence,
-    partner_reach,
-)
+from utopic_cli.estimation.partners import Coincidence
 from utopic_cli.estimation.prior import Prior
 from utopic_cli.estimation.problem import Problem, explained
 from utopic_cli.estimation.refinement import Stage, refine_coarse
@@ -26,7 +20,7 @@ from utopic_cli.result import Correspondences
 MERGE_DISTANCE = 8.0  # voxels
 REFINED = 8  # measured: what ranks lower after screening never turns out best
 REFINED_SPARSE = 30  # partners may yet speak for it
-APPROACHED = 3
+APPROACHED = 5
 PLAUSIBILITY_WEIGHT = 0.1  # of a log-odds, in voxels
 LEAST_LIKENESS = 0.03  # of right ones in 700 trials: .27
 FACING = 2.0  # voxels: behind whatever does not
@@ -119,33 +113,31 @@ class CoarseRefinement:
 
 def refine_candidates(
     problem: Problem, screened: list[Hypothesis], refinement: CoarseRefinement, *, refine: bool
-) -> tuple[list[Candidate], list[Candidate]]:
+) -> list[Candidate]:
     """Refine (if ``refine``) and verify the best of the screened hypotheses.
 
     Returns:
-        The distinct candidates that the prior admits, best first, and those of them whose points have
-        partners.
+        The distinct candidates that the prior admits, best first.
     """
     if not screened:
-        return [], []
+        return []
     source, target = refinement.source, refinement.target
     screened = sorted(screened, key=lambda hypothesis: -hypothesis.score)
     transformations = np.stack([hypothesis.T_target_source for hypothesis in screened])
     centre = source.points.mean(axis=0)
     apart = MERGE_DISTANCE * target.voxel
-    most = REFINED_SPARSE if _nodes_are_points(problem) else REFINED
+    most = REFINED_SPARSE if nodes_are_points(problem) else REFINED
     kept = distinct(transformations, centre, apart / 4, 2.5)[:most]
     transformations, origins = transformations[kept], np.array([screened[i].origin for i in kept])
     if refine:
         transformations = refinement(transformations)
         admitted = refinement.prior.admits(transformations)
         if not admitted.any():
-            return [], []
+            return []
         transformations, origins = transformations[admitted], origins[admitted]
     candidates = _verified(transformations, origins, source, target)
     kept = distinct(np.stack([candidate.T_target_source for candidate in candidates]), centre, apart)
-    candidates = [candidates[i] for i in kept]
-    return candidates, _with_partners(problem, candidates, source, target) if refine else []
+    return [candidates[i] for i in kept]
 
 
 def _verified(
@@ -194,32 +186,35 @@ def weigh(
     ]
 
 
-def _nodes_are_points(problem: Problem) -> bool:
+def nodes_are_points(problem: Problem) -> bool:
     """Tell sparse clouds, used whole, from dense scans, whose nodes are means of many points."""
     return len(problem.source_nodes) >= len(problem.source_dense) and (
         len(problem.target_nodes) >= len(problem.target_dense)
     )
 
 
-def _with_partners(
-    problem: Problem, candidates: list[Candidate], source: Surface, target: Surface
+def with_partners(
+    problem: Problem, coincidence: Coincidence, transformations: np.ndarray, origins: list[str], prior: Prior
 ) -> list[Candidate]:
-    """Return the candidates under which the clouds turn out to share points, refitted to them.
+    """Return candidates under which the clouds turn out to share points, fitted to them, best first.
 
-    Usually none is left, and the surfaces decide. Where some are, the coincidence of single
+    Usually there is none, and the surfaces decide. Where some are, the coincidence of single
     points is the stronger witness: it tells even symmetric poses apart.
+
+    Args:
+        problem: sparse clouds whose nodes are their points.
+        coincidence: of the nodes.
+        transformations: (H, 4, 4) near which to look.
+        origins: where each came from.
+        prior: what it does not admit is no candidate.
     """
-    nodes = problem.source_nodes, problem.target_nodes
-    reach = partner_reach(*nodes) if _nodes_are_points(problem) else 0.0
-    if not reach > 0:
+    fitted, begun = coincidence.meet(transformations, APPROACHED)
+    if not len(fitted):
         return []
-    evidence = partner_evidence(*nodes, np.stack([each.T_target_source for each in candidates]), reach)
-    candidates = [candidates[i] for i in np.argsort(-evidence, kind="stable")[:APPROACHED]]
-    approached = np.stack([approach_partners(*nodes, each.T_target_source, reach) for each in candidates])
-    evidence = partner_evidence(*nodes, approached, reach)
-    order = [i for i in np.argsort(-evidence, kind="stable") if evidence[i] > BEYOND_CHANCE]
-    fitted = [fit_partners(*nodes, approached[i], reach) for i in order]
+    source, target = problem.surfaces
+    kept = distinct(fitted, source.points.mean(axis=0), MERGE_DISTANCE * target.voxel)
+    kept = kept[prior.admits(fitted[kept])]
     return [
-        _verified(T[None], np.array([candidates[i].origin]), source, target)[0]
-        for i, T in zip(order, fitted, strict=True)
+        _verified(T[None], np.array([origins[i]]), source, target)[0]
+        for T, i in zip(fitted[kept], begun[kept], strict=True)
     ]

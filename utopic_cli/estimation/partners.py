@@ -15,7 +15,8 @@ from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.geometry import rigid
 
 BY_CHANCE = 0.2
-"""Largest share of points that come within the reach of another cloud's point by chance."""
+"""Of grids and even samples: largest share of points that come within the reach of another cloud's
+point by chance."""
 
 REGULAR = 2.2
 """Median distance to the eighth over that to the first neighbour: 3.4 in a random sample of a
@@ -24,10 +25,18 @@ surface, still 2.5 where it is thin and noisy, 1.4 on a square grid."""
 NEAR = 4.0
 """A point takes part if the other cloud comes within this many reaches."""
 
-BEYOND_CHANCE = 3.0
-"""Standard deviations above that share from which on partners are believed. Samples of their own
-stay below 0 (nearest neighbours are mutual half of the time only); jitter of a third of the
-typical distance between neighbours leaves 8 and more."""
+SPREADS = (1.0, 1.6, 2.5)
+"""Distances, in reaches, within which partners are looked for: how large the jitter is nobody says. Farther
+off, how the surface lies counts for more than the points on it."""
+
+RING = (1.5, 2.5)
+"""What lies this far off, in multiples of the distance, tells how many points chance brings near."""
+
+BEYOND_CHANCE = 6.0
+"""Standard deviations above chance from which on partners are believed."""
+
+WORTH_A_FIT = 2.5
+"""Standard deviations above chance from which on it is seen what a fit makes of them."""
 
 FEWEST_NEAR = 30
 SLACK = 0.1
@@ -35,73 +44,99 @@ CANDIDATES = 6
 STEPS = 40
 
 
-def partner_reach(source: np.ndarray, target: np.ndarray) -> float:
-    """Return the distance within which points of two clouds may be partners, in their units.
+def _reach(tree: cKDTree) -> tuple[float, bool]:
+    """The reach of one cloud, and whether its points keep their distance.
 
-    At a reach of half the median distance s between nearest neighbours, mutual nearest
-    neighbours come that near by chance for (1 - 2 ** -0.5) / 2 = 0.15 of the points of random
-    samples. Points of grids and even samples keep their distance; there the bound is that a
-    place has at most n * pi * r^2 points within r, for n points per unit of area, and n follows
-    from the distance to the eighth neighbour.
+    Half the median distance between nearest neighbours. Points of grids and even samples keep
+    their distance; there the bound is that a place has at most n * pi * r^2 points within r, for n points
+    per unit of area, and n follows from the distance to the eighth neighbour.
+    """
+    first, eighth = np.median(tree.query(tree.data, k=[2, 9])[0], axis=0)
+    if not np.isfinite(eighth):  # fewer than nine points
+        return 0.0, True
+    if eighth > REGULAR * first:
+        return float(0.5 * first), False
+    return float(np.sqrt(BY_CHANCE / 8.0) * eighth), True
 
-    Args:
+
+class Coincidence:
+    """How far beyond chance points of two clouds coincide under a transformation.
+
+    Of random samples the pairs of points within a distance are counted, one of each cloud. How many of them
+    chance brings follows from the pairs in a ring around it: their ratio is that within either cloud, whose
+    own points come near each other by chance only. In grids and even samples they don't come near each
+    other at all; there it is counted how many points are each other's nearest within the reach.
+
+    Attributes:
         source: (N, 3) points.
         target: (M, 3) points.
-
-    Returns:
-        The reach; 0 for fewer than nine points, or if most are there twice.
+        reach: a distance within which points may be partners; 0 for fewer than nine points, or if most of
+            a cloud's are there twice: nothing can be said.
     """
-    reaches = []
-    for points in (source, target):
-        first, eighth = np.median(cKDTree(points).query(points, k=[2, 9])[0], axis=0)
-        if not np.isfinite(eighth):  # fewer than nine points
-            return 0.0
-        reaches.append(0.5 * first if eighth > REGULAR * first else np.sqrt(BY_CHANCE / 8.0) * eighth)
-    return float(max(reaches))
+
+    def __init__(self, source: np.ndarray, target: np.ndarray) -> None:
+        """Measure the clouds."""
+        self.source, self.target = source, target
+        self._trees = trees = cKDTree(source), cKDTree(target)
+        found = [_reach(tree) for tree in trees]
+        self.reach = 0.0 if any(reach == 0 for reach, _ in found) else max(reach for reach, _ in found)
+        self._regular = any(regular for _, regular in found)
+        self._rings = [_ring(spread * self.reach, trees) for spread in SPREADS]
+
+    def evidence(self, transformations: np.ndarray) -> np.ndarray:
+        """Standard deviations above chance under (H, 4, 4) T_target_source -> (H,).
+
+        Near 0 or below for clouds sampled each on its own, above ``BEYOND_CHANCE`` where partners meet; -inf
+        where hardly a point is near.
+        """
+        if not self.reach > 0:
+            return np.full(len(transformations), -np.inf)
+        beyond = self._mutual_beyond_chance if self._regular else self._pairs_beyond_chance
+        return np.array([beyond(T) for T in transformations], dtype=np.float64)
+
+    def _pairs_beyond_chance(self, T: np.ndarray) -> float:
+        moved = cKDTree(rigid.apply(T, self.source))
+        beyond = -np.inf
+        for radii, ratio in self._rings:
+            close, inner, outer = moved.count_neighbors(self._trees[1], radii)
+            if outer >= FEWEST_NEAR:
+                expected = ratio * (outer - inner)
+                beyond = max(beyond, (close - expected) / np.sqrt(max(expected, 4.0)))
+        return float(beyond)
+
+    def _mutual_beyond_chance(self, T: np.ndarray) -> float:
+        _, _, distance, near = _mutual(self.source, self.target, T, *self._trees, NEAR * self.reach)
+        if near < FEWEST_NEAR:
+            return -np.inf
+        close = np.count_nonzero(distance < self.reach)
+        return float((close - BY_CHANCE * near) / np.sqrt(BY_CHANCE * (1 - BY_CHANCE) * near))
+
+    def meet(self, transformations: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Look for transformations under which partners meet, near some of (H, 4, 4).
+
+        Returns:
+            (K, 4, 4) T_target_source, fitted to the partners, best first, K at most ``most``; and (K,)
+            which of the given ones each began at.
+        """
+        evidence = self.evidence(transformations)
+        begun = np.argsort(-evidence, kind="stable")[:most]
+        begun = begun[evidence[begun] > WORTH_A_FIT]
+        if not len(begun):
+            return transformations[:0], begun
+        fitted = np.stack(
+            [fit_partners(self.source, self.target, transformations[i], self.reach) for i in begun]
+        )
+        evidence = self.evidence(fitted)
+        order = np.argsort(-evidence, kind="stable")
+        order = order[evidence[order] > BEYOND_CHANCE]
+        return fitted[order], begun[order]
 
 
-def partner_evidence(
-    source: np.ndarray, target: np.ndarray, transformations: np.ndarray, reach: float
-) -> np.ndarray:
-    """Say how far beyond chance points of two clouds coincide under H transformations.
-
-    Coincide: are each other's nearest within the reach.
-
-    Args:
-        source: (N, 3) points.
-        target: (M, 3) points.
-        transformations: (H, 4, 4) T_target_source.
-        reach: of ``partner_reach``.
-
-    Returns:
-        (H,) standard deviations above chance: 0 or less for clouds sampled each on its own,
-        above ``BEYOND_CHANCE`` where partners meet; -inf where hardly a point is near.
-    """
-    target_tree, source_tree = cKDTree(target), cKDTree(source)
-    evidence = np.full(len(transformations), -np.inf)
-    for number, T in enumerate(transformations):
-        _, _, distance, near = _mutual(source, target, T, source_tree, target_tree, NEAR * reach)
-        if near >= FEWEST_NEAR:
-            close = np.count_nonzero(distance < reach)
-            evidence[number] = (close - BY_CHANCE * near) / np.sqrt(BY_CHANCE * (1 - BY_CHANCE) * near)
-    return evidence
-
-
-def approach_partners(
-    source: np.ndarray, target: np.ndarray, T: np.ndarray, reach: float, steps: int = 5
-) -> np.ndarray:
-    """Fit a transformation to mutual nearest neighbours a few times over -> (4, 4).
-
-    Cheap, and enough to tell whether partners meet nearby; ``fit_partners`` is the accurate one.
-    """
-    target_tree, source_tree = cKDTree(target), cKDTree(source)
-    for _ in range(steps):
-        index, partner, _, _ = _mutual(source, target, T, source_tree, target_tree, NEAR * reach)
-        try:
-            T = weighted_procrustes(source[index], target[partner], np.ones(len(index)))
-        except ValueError:  # too few, or all on a line: nothing to approach
-            break
-    return T
+def _ring(radius: float, trees: tuple[cKDTree, cKDTree]) -> tuple[np.ndarray, float]:
+    """Radii to count pairs within, and how many come within the first by chance for each in the ring."""
+    radii = radius * np.array([1.0, *RING])
+    close, inner, outer = sum(tree.count_neighbors(tree, radii) - tree.n for tree in trees)
+    return radii, float(close / max(outer - inner, 1.0))
 
 
 def fit_partners(source: np.ndarray, target: np.ndarray, T: np.ndarray, reach: float) -> np.ndarray:
@@ -116,7 +151,7 @@ def fit_partners(source: np.ndarray, target: np.ndarray, T: np.ndarray, reach: f
         source: (N, 3) points.
         target: (M, 3) points, partly jittered copies of source points.
         T: (4, 4) T_target_source to start from, right within a few reaches.
-        reach: of ``partner_reach``.
+        reach: of ``Coincidence``.
 
     Returns:
         (4, 4) float64 T_target_source.

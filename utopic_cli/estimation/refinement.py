@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.estimation.partners import BEYOND_CHANCE, fit_partners, partner_evidence, partner_reach
+from utopic_cli.estimation.partners import BEYOND_CHANCE, Coincidence, fit_partners
 from utopic_cli.estimation.surface import Surface, point_spacing, thinned
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.nearest import nearest
@@ -280,13 +280,11 @@ def _fit_partners(
     """Fit to shared points from the best of (H, 4, 4) transformations; None if there are none."""
     if max(len(moving.points), len(fixed.points)) > MOST_PARTNERS:
         return None
-    reach = partner_reach(moving.points, fixed.points)
-    if not reach > 0:
-        return None
-    evidence = partner_evidence(moving.points, fixed.points, transformations, reach)
+    coincidence = Coincidence(moving.points, fixed.points)
+    evidence = coincidence.evidence(transformations)
     if not evidence.max() > BEYOND_CHANCE:
         return None
-    return fit_partners(moving.points, fixed.points, transformations[evidence.argmax()], reach)
+    return fit_partners(moving.points, fixed.points, transformations[evidence.argmax()], coincidence.reach)
 
 
 def _descend(moving: _FullSurface, fixed: _FullSurface, T: np.ndarray, reach: float) -> np.ndarray:

@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from utopic_cli.estimation.candidates import Candidate, CoarseRefinement, refine_candidates, screen, weigh
+from utopic_cli.estimation.candidates import (
+    Candidate,
+    CoarseRefinement,
+    nodes_are_points,
+    refine_candidates,
+    screen,
+    weigh,
+    with_partners,
+)
 from utopic_cli.estimation.close_up import CloseUp, close_ups
 from utopic_cli.estimation.consensus import Hypothesis, consensus_hypotheses, distinct
 from utopic_cli.estimation.correspondences import (
@@ -15,13 +23,14 @@ from utopic_cli.estimation.correspondences import (
     linear_assignment,
     overlap_weights,
 )
+from utopic_cli.estimation.partners import Coincidence
 from utopic_cli.estimation.prior import ANYWHERE, Prior
 from utopic_cli.estimation.problem import Problem, check_problem, explained
 from utopic_cli.estimation.procrustes import weighted_procrustes
-from utopic_cli.estimation.surface import Surface
 from utopic_cli.result import Correspondences
 
 CONSENSUS_TOLERANCE = 2.5  # voxels
+PARTNERS_TOLERANCE = 2.0  # reaches
 PROPOSED = 200
 FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
@@ -138,27 +147,27 @@ def solve(
     if solver != "consensus":
         hypotheses += _assignment_hypothesis(problem)
     if solver != "svd":
-        hypotheses += _consensus(problem, candidates, source, target, voxel, prior)
+        hypotheses += _consensus(problem, candidates, CONSENSUS_TOLERANCE * voxel, prior)
     hypotheses = _admitted(hypotheses, prior)
     if not hypotheses:
         raise ValueError(_nothing(prior))
     refine = solver != "svd"
-    tried = min(FIRST, len(hypotheses))
-    screened = _admitted(screen(hypotheses[:tried], source, target, refine=refine), prior)
-    refinement = CoarseRefinement(source, target, prior)
-    chosen, partners = refine_candidates(problem, screened, refinement, refine=refine)
-    unsure = not partners and (not chosen or chosen[0].score < BEYOND_DOUBT)
-    if unsure and tried < len(hypotheses):
-        screened += _admitted(screen(hypotheses[tried:], source, target, refine=refine), prior)
-        tried = len(hypotheses)
-        chosen, partners = refine_candidates(problem, screened, refinement, refine=refine)
+    shared = _SharedPoints(problem, prior) if refine and nodes_are_points(problem) else None
+    partners = shared.near(hypotheses[:FIRST], candidates) if shared is not None else []
+    tried = len(hypotheses)
+    if partners:
+        chosen = partners
+    else:
+        chosen, tried = _refined(problem, hypotheses, prior, refine=refine)
+        partners = shared.near(list(map(_as_hypothesis, chosen))) if shared is not None else []
+        chosen = partners or chosen
     if not chosen:  # all were drawn beyond what is admitted
         raise ValueError(_nothing(prior))
     correspondences = candidates
     if solver == "svd" and chosen[0].origin == "assignment":
         correspondences = _assignment(problem)
     tolerance = CONSENSUS_TOLERANCE * voxel
-    chosen = weigh(problem, partners or chosen, correspondences, tolerance, source, target)
+    chosen = weigh(problem, chosen, correspondences, tolerance, source, target)
     if refine and not partners:
         chosen.sort(key=lambda candidate: -candidate.standing)
         if verify is not None:
@@ -174,6 +183,58 @@ def solve(
         method=best.origin if solver == "auto" else solver,
         shared_points=bool(partners),
     )
+
+
+def _refined(
+    problem: Problem, hypotheses: list[Hypothesis], prior: Prior, *, refine: bool
+) -> tuple[list[Candidate], int]:
+    """Screen, refine and verify hypotheses, no more of them than are needed.
+
+    Returns:
+        The candidates, best first, and how many hypotheses were tried.
+    """
+    source, target = problem.surfaces
+    refinement = CoarseRefinement(source, target, prior)
+    tried = min(FIRST, len(hypotheses))
+    screened = _admitted(screen(hypotheses[:tried], source, target, refine=refine), prior)
+    chosen = refine_candidates(problem, screened, refinement, refine=refine)
+    if tried < len(hypotheses) and (not chosen or chosen[0].score < BEYOND_DOUBT):
+        screened += _admitted(screen(hypotheses[tried:], source, target, refine=refine), prior)
+        tried = len(hypotheses)
+        chosen = refine_candidates(problem, screened, refinement, refine=refine)
+    return chosen, tried
+
+
+class _SharedPoints:
+    """Looks for transformations under which sparse clouds turn out to share points."""
+
+    def __init__(self, problem: Problem, prior: Prior) -> None:
+        self.problem, self.prior = problem, prior
+        self.coincidence = Coincidence(problem.source_nodes, problem.target_nodes)
+
+    def near(
+        self, hypotheses: list[Hypothesis], correspondences: Correspondences | None = None
+    ) -> list[Candidate]:
+        """Return what shares points near hypotheses, or else near what correspondences agree on closely.
+
+        Partners match exactly, which hypotheses about surfaces don't ask for.
+        """
+        found = self._near(hypotheses)
+        if not found and correspondences is not None and self.coincidence.reach > 0:
+            tolerance = PARTNERS_TOLERANCE * self.coincidence.reach
+            found = self._near(_consensus(self.problem, correspondences, tolerance, self.prior, FIRST))
+        return found
+
+    def _near(self, hypotheses: list[Hypothesis]) -> list[Candidate]:
+        if not hypotheses:
+            return []
+        transformations = np.stack([hypothesis.T_target_source for hypothesis in hypotheses])
+        origins = [hypothesis.origin for hypothesis in hypotheses]
+        return with_partners(self.problem, self.coincidence, transformations, origins, self.prior)
+
+
+def _as_hypothesis(candidate: Candidate) -> Hypothesis:
+    return Hypothesis(candidate.T_target_source, candidate.score, candidate.origin)
 
 
 def _verified(
@@ -236,23 +297,19 @@ def _weighted_candidates(problem: Problem) -> Correspondences:
 
 
 def _consensus(
-    problem: Problem,
-    candidates: Correspondences,
-    source: Surface,
-    target: Surface,
-    voxel: float,
-    prior: Prior,
+    problem: Problem, candidates: Correspondences, tolerance: float, prior: Prior, most: int = PROPOSED
 ) -> list[Hypothesis]:
     if len(candidates) < 3:
         return []
+    source, target = problem.surfaces
     source_nodes = problem.source_nodes[candidates.source_indices]
     target_nodes = problem.target_nodes[candidates.target_indices]
     return consensus_hypotheses(
         source_nodes,
         target_nodes,
         candidates.weights,
-        CONSENSUS_TOLERANCE * voxel,
-        PROPOSED,
+        tolerance,
+        most,
         source.normals[source.tree.query(source_nodes)[1]],
         target.normals[target.tree.query(target_nodes)[1]],
         prior,
