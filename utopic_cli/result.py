@@ -104,7 +104,7 @@ class RegistrationResult:
         target_overlap: (M,) float32 in [0, 1], one per target point.
         source_uncertainty: (N,) float32 in [0, 1], min-max normalised over the pair.
         target_uncertainty: (M,) float32 in [0, 1], min-max normalised over the pair.
-        raw_uncertainty: un-normalised sample variance of the overlap per network point,
+        raw_uncertainty: un-normalised variance per network point (``model.uncertainty``),
             summarised: keys ``source_mean``, ``target_mean``, ``p50``, ``p90``.
         correspondences: indices into the original points, with weights.
         fit: measures at full resolution.
