@@ -33,8 +33,8 @@ RING = (1.5, 2.5)
 """What lies this far off, in multiples of the distance, tells how many points chance brings near."""
 
 BEYOND_CHANCE = 6.5
-"""Standard deviations above chance from which on partners are believed. Of the transformations tried for 100 pairs of
-samples of their own the best had 5.1."""
+"""Standard deviations above chance from which on partners are believed. Of the transformations tried for
+100 pairs of samples of their own the best had 5.1."""
 
 WORTH_A_FIT = 2.5
 """Standard deviations above chance from which on it is seen what a fit makes of them."""
