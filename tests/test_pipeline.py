@@ -121,8 +121,9 @@ def test_the_same_seed_gives_the_same_bits(pair, result):
     assert np.array_equal(again.T_target_source, result.T_target_source)
     for name in ("source_overlap", "target_overlap", "source_uncertainty", "target_uncertainty"):
         assert np.array_equal(getattr(again, name), getattr(result, name)), name
+    # The network draws nothing whose outcome matters.
     other = register(pair.source, pair.target, dataclasses.replace(OPTIONS, seed=1))
-    assert not np.array_equal(other.source_uncertainty, result.source_uncertainty)
+    assert np.array_equal(other.source_uncertainty, result.source_uncertainty)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])

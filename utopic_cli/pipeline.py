@@ -174,7 +174,7 @@ def _register(
     rivals = tuple(
         prepared.denormalise(rival.T_target_source)
         for rival in estimate.rivals
-        if estimate.best.standing - rival.standing < RIVAL_LAG
+        if estimate.lag(rival) < RIVAL_LAG
     )
     verdict = judge(
         calibration,

@@ -33,6 +33,7 @@ heads = 2
 layers = 1
 uncertainty_samples = 5
 hypothesis = false
+uncertainty_scheme = "sampled"
 [schedule]
 descriptor_pairs = 2
 joint_pairs = 4

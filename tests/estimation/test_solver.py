@@ -189,3 +189,13 @@ def test_two_estimates_of_one_pair_are_joined(
     np.testing.assert_array_equal(doubted.rivals[0].T_target_source, automatic.T_target_source @ turn)
     standings = [rival.standing for rival in doubted.rivals]
     assert standings == sorted(standings, reverse=True)
+
+
+def test_a_rival_that_the_verifier_likes_little_less_lags_by_the_surfaces_alone(automatic: Estimate) -> None:
+    def lag(preferred: float) -> float:
+        rival = replace(automatic.best, plausibility=automatic.best.plausibility - preferred)
+        return automatic.lag(rival)
+
+    assert lag(2.0) == pytest.approx(0.0, abs=1e-9)  # the same surfaces
+    assert lag(5.0) == pytest.approx(0.5)
+    assert lag(-2.0) == pytest.approx(-0.2)

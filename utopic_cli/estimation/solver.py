@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from utopic_cli.estimation.candidates import (
+    PLAUSIBILITY_WEIGHT,
     Candidate,
     CoarseRefinement,
     nodes_are_points,
@@ -36,6 +37,7 @@ FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
 RIVALS = 5
 VERIFIED = 8  # best candidates that are looked at closely
+DECIDED = 3.0  # log-odds by which a verifier that is sure prefers the answer: 20 to 1
 SURE = 5.0  # log-odds of an answer that rests on shared points
 SAME_PLACE = 0.15  # of the source's radius: what two samplings' answers to one question may differ by
 
@@ -91,6 +93,17 @@ class Estimate:
         """By how much the answer's standing exceeds that of its best rival, in [0, 1]; 1 without any."""
         rival = max((rival.standing for rival in self.rivals), default=-np.inf)
         return float(np.clip(self.best.standing - rival, 0.0, 1.0))
+
+    def lag(self, rival: Candidate) -> float:
+        """By how much a rival's standing lags behind the answer's.
+
+        Where the verifier prefers the answer but is not sure of it, by the surfaces alone: of the poses of a
+        symmetric thing it prefers some one, too.
+        """
+        preferred = self.best.plausibility - rival.plausibility
+        unsure = 0.0 < preferred < DECIDED
+        excused = PLAUSIBILITY_WEIGHT * preferred if unsure else 0.0
+        return self.best.standing - rival.standing - excused
 
     def outranks(self, other: Estimate) -> bool:
         """Tell whether more speaks for this estimate than for another one of the same scans."""
