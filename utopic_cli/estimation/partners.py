@@ -82,7 +82,9 @@ class Coincidence:
         found = [_reach(tree) for tree in trees]
         self.reach = 0.0 if any(reach == 0 for reach, _ in found) else max(reach for reach, _ in found)
         self._regular = any(regular for _, regular in found)
-        self._rings = [_ring(spread * self.reach, trees) for spread in SPREADS]
+        # Of the others the nearest are looked at.
+        spreads = () if self._regular else SPREADS
+        self._rings = [_ring(spread * self.reach, trees) for spread in spreads]
 
     def evidence(self, transformations: np.ndarray) -> np.ndarray:
         """Standard deviations above chance under (H, 4, 4) T_target_source -> (H,).

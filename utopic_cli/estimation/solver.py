@@ -167,7 +167,7 @@ def solve(
     refine = solver != "svd"
     shared = _SharedPoints(problem, prior) if refine and nodes_are_points(problem) else None
     partners = shared.near(hypotheses[:FIRST], candidates) if shared is not None else []
-    tried = len(hypotheses)
+    tried = min(FIRST, len(hypotheses))
     if partners:
         chosen = partners
     else:
