@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from utopic_cli import align, pipeline
-from utopic_cli.bridge import read_overlap
+from utopic_cli.bridge import weigh
 from utopic_cli.config import AlignOptions
 from utopic_cli.errors import InputError, UsageError
 from utopic_cli.geometry import rigid
@@ -57,15 +57,16 @@ def test_every_original_point_gets_an_overlap_and_an_uncertainty(pair, result):
         assert values.min() >= 0 and values.max() <= 1 and np.ptp(values) > 0.1
 
 
-def test_overlap_is_weighed_with_the_confidence(pair, result, monkeypatch):
+def test_what_is_seen_is_weighed_with_the_confidence(pair, result, monkeypatch):
     """With the confidence where there is one, else with what the solve makes of it."""
     weighed = []
 
-    def noted(model, view, odds):
+    def noted(model, first, shown, odds):
+        assert first.source_gap is None and shown.source_gap is not None
         weighed.append(odds)
-        return read_overlap(model, view, odds)
+        return weigh(model, first, shown, odds)
 
-    monkeypatch.setattr(pipeline, "read_overlap", noted)
+    monkeypatch.setattr(pipeline, "weigh", noted)
     again = register(pair.source, pair.target, OPTIONS)
     assert np.array_equal(again.source_overlap, result.source_overlap)
     confidence = min(max(result.confidence, 0.001), 0.999)
@@ -73,12 +74,10 @@ def test_overlap_is_weighed_with_the_confidence(pair, result, monkeypatch):
 
     doubted = []
     monkeypatch.setattr(pipeline, "read_calibration", lambda card: None)
-    monkeypatch.setattr(
-        pipeline, "read_overlap", lambda *given: doubted.append(given) or read_overlap(*given)
-    )
+    monkeypatch.setattr(pipeline, "weigh", lambda *given: doubted.append(given) or weigh(*given))
     uncalibrated = register(pair.source, pair.target, OPTIONS)
     assert uncalibrated.confidence is None
-    assert [odds for _, _, odds in doubted] == [uncalibrated.signals["plausibility"]]
+    assert [odds for *_, odds in doubted] == [uncalibrated.signals["plausibility"]]
 
 
 def known_overlap(pair):

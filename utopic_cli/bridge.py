@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import POINT_FEATURES, WHOLE_FEATURES, CloseUp
-from utopic_cli.geometry.nearest import search_threads
+from utopic_cli.geometry import rigid
+from utopic_cli.geometry.nearest import nearest, search_threads
 from utopic_cli.model.cloud_input import CloudInput
 from utopic_cli.model.pose_verifier import PoseVerifier
 from utopic_cli.model.utopic import EncodedCloud, Prediction, Utopic
@@ -33,6 +36,8 @@ class NetworkView:
         source_overlap: (N,), target_overlap: (M,) probabilities.
         source_uncertainty: (N,), target_uncertainty: (M,) min-max normalised over the pair.
         source_raw: (N,), target_raw: (M,) un-normalised.
+        source_gap: (N,), target_gap: (M,) distances to the other cloud's nearest point under the
+            transformation that the network was shown, in node spacings; None where it was shown none.
         verify: chooses among poses that follow from it; None where nothing has learned to.
     """
 
@@ -43,6 +48,8 @@ class NetworkView:
     target_uncertainty: np.ndarray
     source_raw: np.ndarray
     target_raw: np.ndarray
+    source_gap: np.ndarray | None = None
+    target_gap: np.ndarray | None = None
     verify: Verify | None = None
 
 
@@ -100,7 +107,11 @@ class Eye:
                 else torch.from_numpy(hypothesis.astype(np.float32))[None].to(device),
                 encoded=(encoded_source, encoded_target),
             )
-        return _as_view(prediction, self.model)
+        view = _as_view(prediction, self.model)
+        if hypothesis is None:
+            return view
+        source_gap, target_gap = gaps(prepared, hypothesis)
+        return replace(view, source_gap=source_gap, target_gap=target_gap)
 
     def _encode(self, cloud: SampledCloud, spacing: float) -> tuple[CloudInput, EncodedCloud]:
         for known, given, encoded in self._seen:
@@ -127,19 +138,52 @@ def predict(
     return Eye(model, seed)(prepared, hypothesis)
 
 
-def read_overlap(model: Utopic, view: NetworkView, odds: float) -> NetworkView:
-    """Weigh the overlap that the network sees when shown a transformation with how likely that is right.
+def gaps(prepared: PreparedPair, T_target_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measure how far each sampled point is from the other cloud's nearest, in node spacings.
 
     Args:
-        model: the network; without a verifier nothing changes.
-        view: of the network, shown the transformation.
+        prepared: the pair.
+        T_target_source: (4, 4) between the normalised clouds.
+
+    Returns:
+        (N,) and (M,) float64.
+    """
+    moved = rigid.apply(T_target_source, prepared.source.points)
+    there, _ = nearest(cKDTree(prepared.target.points), moved)
+    back, _ = nearest(cKDTree(moved), prepared.target.points)
+    return there / prepared.spacing, back / prepared.spacing
+
+
+def weigh(model: Utopic, first: NetworkView, shown: NetworkView, odds: float) -> NetworkView:
+    """Weigh what follows of each point if a transformation is right with what does if it is not.
+
+    Overlap is read from where the scans meet under it. Uncertainty is the network's, shown the
+    transformation, and what it was at first: a point without a counterpart under a wrong one is not certain.
+
+    Args:
+        model: the network; without a verifier ``shown`` is returned as it is.
+        first: of the network at first sight.
+        shown: of the network, shown the transformation.
         odds: log-odds that it is right.
     """
     verifier = model.verifier
-    if verifier is None:
-        return view
-    source, target = (verifier.read(overlap, odds) for overlap in (view.source_overlap, view.target_overlap))
-    return replace(view, source_overlap=source, target_overlap=target)
+    if verifier is None or shown.source_gap is None or shown.target_gap is None:
+        return shown
+    right = float(expit(odds))
+    source_raw = right * shown.source_raw + (1.0 - right) * first.source_raw
+    target_raw = right * shown.target_raw + (1.0 - right) * first.target_raw
+    lowest = min(source_raw.min(), target_raw.min())
+    span = max(source_raw.max(), target_raw.max()) - lowest
+    scale = 1.0 / span if span > 1e-9 else 0.0  # as in normalise_uncertainty
+    return replace(
+        shown,
+        source_overlap=verifier.read_overlap(shown.source_gap, odds),
+        target_overlap=verifier.read_overlap(shown.target_gap, odds),
+        source_raw=source_raw,
+        target_raw=target_raw,
+        source_uncertainty=scale * (source_raw - lowest),
+        target_uncertainty=scale * (target_raw - lowest),
+    )
 
 
 def verify(verifier: PoseVerifier, shown: Sequence[CloseUp]) -> np.ndarray:
@@ -163,7 +207,7 @@ def _as_view(prediction: Prediction, model: Utopic) -> NetworkView:
         _array(prediction.target_uncertainty),
         _array(prediction.source_distribution.raw_uncertainty),
         _array(prediction.target_distribution.raw_uncertainty),
-        None if model.verifier is None else partial(verify, model.verifier),
+        verify=None if model.verifier is None else partial(verify, model.verifier),
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.bridge import Eye, NetworkView, cpu_threads, load_network, read_overlap
+from utopic_cli.bridge import Eye, NetworkView, cpu_threads, load_network, weigh
 from utopic_cli.clock import Clock, Progress
 from utopic_cli.config import SOLVERS, AlignOptions, OptionValues
 from utopic_cli.errors import InputError, UsageError
@@ -190,7 +190,8 @@ def _register(
     )
     if shown:
         calibrated = None if estimate.shared_points else verdict.odds  # no calibration knows such points
-        view = read_overlap(model, view, estimate.odds if calibrated is None else calibrated)
+        odds = estimate.odds if calibrated is None else calibrated
+        view = weigh(model, answer.view, view, odds)
     clock.start("carry to all points")
     source_all = _carry(
         frame.points[0],

@@ -18,6 +18,7 @@ from utopic_cli.benchmark.protocols import (
 )
 from utopic_cli.errors import UsageError
 from utopic_cli.geometry.rigid import apply
+from utopic_cli.model.pose_verifier import MEETING_REACH
 from utopic_cli.synthesis.pairs import evaluation_pairs
 from utopic_cli.synthesis.procedural import procedural_mesh
 from utopic_cli.synthesis.scan_pair import DegeneratePair
@@ -108,7 +109,7 @@ def test_rooms_overlap_enough_and_bring_the_whole_room(shapes: ShapeLibrary) -> 
 
 
 def test_overlap_means_the_same_as_in_training() -> None:
-    assert SCAN_REACH == POSITIVE_REACH
+    assert SCAN_REACH == POSITIVE_REACH == MEETING_REACH
 
 
 @pytest.mark.parametrize("sampling", ["shared", "independent"])

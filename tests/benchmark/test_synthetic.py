@@ -52,16 +52,20 @@ class Oracle:
     def settings(self) -> dict[str, str]:
         return {}
 
-    def look(self, prepared, hypothesis=None, odds=None) -> NetworkView:
+    def look(self, prepared) -> NetworkView:
+        return self.told(prepared, 0.0)
+
+    def look_again(self, prepared, first, hypothesis, odds) -> NetworkView:
+        assert hypothesis.shape == (4, 4) and np.isfinite(odds) and not first.source_overlap.any()
+        return self.told(prepared, 1.0)
+
+    def told(self, prepared, overlap: float) -> NetworkView:
         moved = apply(prepared.normalise(self.gt), prepared.source.points)
         distance = np.linalg.norm(moved[:, None] - prepared.target.points[None], axis=2)
         scores = np.exp(-0.5 * (distance / (0.3 * prepared.spacing)) ** 2)
         n, m = scores.shape
-        said = 0.0 if hypothesis is None else 1.0
-        assert (odds is None) == (hypothesis is None)
-        return NetworkView(
-            scores, np.full(n, said), np.full(m, said), np.zeros(n), np.zeros(m), np.zeros(n), np.zeros(m)
-        )
+        both = np.full(n, overlap), np.full(m, overlap)
+        return NetworkView(scores, *both, np.zeros(n), np.zeros(m), np.zeros(n), np.zeros(m))
 
 
 def test_an_oracle_is_measured_as_one(shapes: ShapeLibrary) -> None:
@@ -94,7 +98,7 @@ def test_scores_that_lead_nowhere_are_a_counted_failure(shapes: ShapeLibrary) ->
     class Blind(Oracle):
         name, tells_overlap, looks_again = "blind", False, False
 
-        def look(self, prepared, hypothesis=None, odds=None) -> NetworkView:
+        def look(self, prepared) -> NetworkView:
             view = super().look(prepared)
             return replace(view, matching_scores=np.zeros_like(view.matching_scores))
 

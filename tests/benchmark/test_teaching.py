@@ -12,6 +12,7 @@ from utopic_cli.benchmark.teaching import FEWEST, fit, learn, plausible, reading
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
 from utopic_cli.geometry import rigid
+from utopic_cli.model.pose_verifier import MEETING_REACH, meeting
 from utopic_cli.synthesis.packing import open_shapes
 
 
@@ -23,8 +24,7 @@ def made_up(number: int, tell: float = 1.5) -> Lesson:
     points[right, :, 3] += tell
     whole = rng.standard_normal((4, WHOLE_FEATURES)).astype(np.float32)
     proposed = np.array([True, True, True, number % 5 > 0])
-    # Logits that are too high by two and half as large as they ought to be.
-    odds = rng.normal(0.0, 2.0, 100)
+    gap = rng.uniform(0.0, 3.0, 100)
     return Lesson(
         "scans",
         f"shape {number}",
@@ -33,8 +33,8 @@ def made_up(number: int, tell: float = 1.5) -> Lesson:
         right,
         proposed,
         rng.standard_normal(4),
-        odds / 2.0 + 2.0,
-        rng.random(100) < 1.0 / (1.0 + np.exp(-odds)),
+        gap,
+        rng.random(100) < 1.0 / (1.0 + np.exp(1.0 - 3.0 * meeting(gap))),
     )
 
 
@@ -73,20 +73,21 @@ def test_it_is_measured_on_shapes_left_out(lessons):
 
 
 def test_overlap_is_read_as_it_turned_out(lessons):
-    lost = [replace(lessons[0], overlap=np.zeros(0), overlaps=np.arange(10) < share) for share in (2, 4)]
+    lost = [replace(lessons[0], gap=np.zeros(0), overlaps=np.arange(10) < share) for share in (2, 4)]
     lessons = [*lessons, *lost]
     slope, shift, usual = reading_of(lessons)
     assert usual == pytest.approx(0.3)
-    assert abs(slope - 2.0) < 0.25 and abs(shift + 4.0) < 0.5
+    assert abs(slope - 3.0) < 0.4 and abs(shift + 1.0) < 0.2
     verifier, described = learn(lessons, {}, 0)
-    assert np.allclose(verifier.reading.numpy(), [slope, shift, usual])
+    assert np.allclose(verifier.overlap.numpy(), [slope, shift, usual])
     told = described["overlap"]
-    assert told["points"] == 6000 and told["accuracy"] > told["accuracy_as_it_is"] + 0.1
-    assert reading_of(lessons[:4]).tolist() == [1.0, 0.0, 0.0]  # too few to tell
-    turned = [replace(lesson, overlap=-lesson.overlap) for lesson in lessons[:60]]
-    assert reading_of(turned).tolist() == [1.0, 0.0, 0.0]
+    assert told["points"] == 6000 and 0.7 < told["accuracy"] < 0.85
+    unread = [8.0, -4.0, 0.0]
+    assert reading_of(lessons[:4]).tolist() == unread  # too few to tell
+    farther = [replace(lesson, gap=3.0 - lesson.gap) for lesson in lessons[:60]]
+    assert reading_of(farther).tolist() == unread
     alone = [replace(lesson, overlaps=np.ones(100, bool)) for lesson in lessons[:60]]
-    assert reading_of(alone).tolist() == [1.0, 0.0, 0.0]
+    assert reading_of(alone).tolist() == unread
 
 
 def test_too_few_lessons_are_refused(lessons):
@@ -136,8 +137,8 @@ def test_a_lesson_holds_the_known_answer_and_what_the_solve_proposed():
         if lesson.kind in ("different", "mirrored", "disjoint"):
             assert not lesson.right.any() and lesson.proposed.all()
     first = lessons[0]
-    assert len(first.overlap) == len(first.overlaps) > 400 and first.overlaps.any()
-    assert ((first.overlap > 0) == first.overlaps).mean() > 0.7
-    assert not any(len(lesson.overlap) + len(lesson.overlaps) for lesson in lessons[1:])
+    assert len(first.gap) == len(first.overlaps) > 400 and first.overlaps.any()
+    assert ((first.gap < MEETING_REACH) == first.overlaps).mean() > 0.9
+    assert not any(len(lesson.gap) + len(lesson.overlaps) for lesson in lessons[1:])
     assert any(lesson.right.any() and not lesson.right.all() for lesson in lessons)
     assert again is not None and found[1] is not None and np.array_equal(again.points, found[1].points)

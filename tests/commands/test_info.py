@@ -54,7 +54,7 @@ def test_weights_of_ones_own_are_described_beside_the_bundled_ones(cli, monkeypa
         (tmp_path / f"mine{suffix}").write_bytes(bundled.with_suffix(suffix).read_bytes())
     mine = str(tmp_path / "mine.safetensors")
     weights = json.loads(cli("info", mine, "--json").stdout)["weights"]
-    assert list(weights) == ["utopic", "paper-pairs", mine]
+    assert list(weights) == ["utopic", mine]
     assert weights[mine]["intact"] is True and weights[mine]["pairs_seen"] == weights["utopic"]["pairs_seen"]
     missing = cli("info", str(tmp_path / "none.safetensors"))
     assert missing.exit_code == 4 and "none.safetensors: no such weights file" in missing.stderr

@@ -111,6 +111,61 @@ def test_even_samples_of_their_own_do_not_pass_for_shared_points() -> None:
     assert Coincidence(source, source + 0.001).evidence(np.eye(4)[None])[0] > 2 * BEYOND_CHANCE
 
 
+def flag(rng: np.random.Generator) -> np.ndarray:
+    """A pole 2 long, hardly thicker than its points are apart, with a sheet on one side."""
+    pole = np.column_stack([rng.uniform(-1.0, 1.0, 100), 0.01 * rng.normal(size=(100, 2))])
+    sheet = np.column_stack([rng.uniform(-1.0, 1.0, 400), rng.uniform(0.3, 2.3, 400), np.zeros(400)])
+    return np.concatenate([pole, sheet])
+
+
+def test_poles_that_meet_do_not_pass_for_shared_points() -> None:
+    # Turned about the pole only poles meet. Pairs crowd there as they don't on a sheet.
+    turn = rigid.rotation_from_vector(np.array([np.pi, 0.0, 0.0]))
+    poses = np.stack([rigid.rigid(turn, np.array([shift, 0.0, 0.0])) for shift in np.linspace(-0.5, 0.5, 21)])
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        source, other = flag(rng), flag(rng)
+        assert Coincidence(source, other).evidence(poses).max() < 0.8 * BEYOND_CHANCE
+        same = source + 0.003 * rng.normal(size=source.shape)
+        assert Coincidence(source, same).evidence(np.eye(4)[None])[0] > 2 * BEYOND_CHANCE
+
+
+def test_a_crowd_elsewhere_does_not_hide_shared_points() -> None:
+    rng = np.random.default_rng(0)
+    sheet = np.column_stack([rng.uniform(-1.0, 1.0, (400, 2)), np.zeros(400)])
+    source, target = (sheet + 0.02 * rng.normal(size=sheet.shape) for _ in range(2))
+    rod = np.column_stack([3.0 + rng.uniform(-1.0, 1.0, 200), 0.005 * rng.normal(size=(200, 2))])
+    coincidence = Coincidence(np.concatenate([source, rod]), target)
+    assert coincidence.evidence(np.eye(4)[None])[0] > 1.1 * BEYOND_CHANCE
+    assert len(coincidence.meet(np.eye(4)[None], 1)[0]) == 1
+
+
+def test_shared_points_are_found_where_neither_matches_nor_surfaces_tell(
+    gt_transformation: np.ndarray,
+) -> None:
+    rng = np.random.default_rng(6)
+    ball = rng.normal(size=(600, 3))
+    ball /= np.linalg.norm(ball, axis=1)[:, None]
+    rows = crop(ball, (1.0, 0.2, 0.0)), crop(ball, (0.3, 1.0, 0.5))
+    source, target = (ball[each] + rng.normal(0, 0.01, (len(each), 3)) for each in rows)
+    target = rigid.apply(gt_transformation, target)
+    problem = Problem(
+        source_nodes=source,
+        target_nodes=target,
+        matching_scores=rng.random((len(source), len(target))),
+        source_overlap=np.ones(len(source)),
+        target_overlap=np.ones(len(target)),
+        source_certainty=np.ones(len(source)),
+        target_certainty=np.ones(len(target)),
+        source_dense=surface_of(source),
+        target_dense=surface_of(target),
+        spacing=0.1,
+    )
+    estimate = solve(problem)
+    assert estimate.shared_points
+    assert rigid.relative_rotation_error_deg(estimate.T_target_source, gt_transformation) < 0.5
+
+
 def test_few_or_doubled_points_say_nothing() -> None:
     points = np.random.default_rng(0).normal(size=(100, 3))
     for cloud in (points[:8], np.repeat(points, 2, axis=0)):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 import torch
 
 from tests.model.conftest import SMALL
 from utopic_cli.config import ModelConfig
 from utopic_cli.errors import InputError
-from utopic_cli.model.pose_verifier import PoseVerifier
+from utopic_cli.model.pose_verifier import MEETING_REACH, PoseVerifier, meeting
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import load_weights, pack_weights
 
@@ -43,10 +44,15 @@ def test_features_are_brought_to_one_scale_and_cut_off(verifier):
     assert torch.isfinite(verifier(far, whole)).all()
 
 
+def test_the_other_scan_is_met_within_its_reach():
+    met = meeting(MEETING_REACH * np.array([0.0, 0.5, 1.0, 2.0, np.inf]))
+    np.testing.assert_allclose(met, [1.0, 64.0 / 65.0, 0.5, 1.0 / 65.0, 0.0])
+
+
 def test_a_verifier_is_kept_with_the_weights(tmp_path, verifier):
     model = Utopic(ModelConfig(**SMALL))
     model.verifier = verifier
-    verifier.reading.copy_(torch.tensor([1.5, -0.5, 0.25]))
+    verifier.overlap.copy_(torch.tensor([2.0, -0.5, 0.25]))
     blob, card = pack_weights(model, {"verifier": {"pairs": 7}})
     path = tmp_path / "tiny.safetensors"
     path.write_bytes(blob)
@@ -54,7 +60,7 @@ def test_a_verifier_is_kept_with_the_weights(tmp_path, verifier):
     loaded, described = load_weights(str(path))
     assert described["verifier"] == {"pairs": 7, "sizes": verifier.sizes}
     assert loaded.verifier is not None and not loaded.verifier.training
-    assert loaded.verifier.reading.tolist() == [1.5, -0.5, 0.25]
+    assert loaded.verifier.overlap.tolist() == [2.0, -0.5, 0.25]
     points, whole = torch.randn(2, 20, 6), torch.randn(2, 3)
     torch.testing.assert_close(loaded.verifier(points, whole), verifier(points, whole), atol=1e-2, rtol=1e-2)
     described = json.loads(path.with_suffix(".json").read_text())

@@ -14,6 +14,7 @@ from utopic_cli.model.uncertainty import OverlapDistribution
 from utopic_cli.training.completion import CompletionDecoder, canonical_frame
 from utopic_cli.training.labels import Labels, label_pair, mutual_nearest
 from utopic_cli.training.losses import (
+    FAR_WEIGHT,
     chamfer_loss,
     descriptor_loss,
     overlap_loss,
@@ -211,11 +212,14 @@ def test_reliability_loss_reads_the_variance_as_odds_of_a_wrong_match():
     valid = torch.tensor([[1.0, 1, 1, 1, 0]])
     distribution = spread_out([0.02 / 3, 0.06, 0.18, 0.2, 0.2])  # odds 1/3, 3, 9
     expected = -(math.log(3 / 4) + math.log(3 / 4) + math.log(9 / 10)) / 3
-    assert float(reliability_loss(distribution, scores, near, overlap, valid)) == pytest.approx(
-        expected, rel=1e-4
-    )
+    blind, shown = torch.zeros(1), torch.ones(1)
+    found = float(reliability_loss(distribution, scores, near, overlap, valid, blind))
+    assert found == pytest.approx(expected, rel=1e-4)
     other = spread_out([0.06, 0.06, 0.18, 0.2, 0.2])
-    assert float(reliability_loss(other, scores, near, overlap, valid)) > expected + 0.3
+    assert float(reliability_loss(other, scores, near, overlap, valid, blind)) > expected + 0.3
+    # Shown a transformation, it should be seen that point 3 has no match to be wrong: odds 10.
+    found = float(reliability_loss(distribution, scores, near, overlap, valid, shown))
+    assert found == pytest.approx((3 * expected + FAR_WEIGHT * math.log(11)) / (3 + FAR_WEIGHT), rel=1e-4)
 
 
 def test_reliability_loss_moves_the_variance_of_a_wrong_point_up():
@@ -224,5 +228,7 @@ def test_reliability_loss_moves_the_variance_of_a_wrong_point_up():
     samples = torch.sigmoid(mean[:, None] + noise * (0.5 * log_variance).exp()[:, None])
     distribution = OverlapDistribution(mean, log_variance, samples, samples.var(dim=1, unbiased=False))
     scores, near = torch.tensor([[[0.9, 0.1]]]), torch.tensor([[[False, True]]])
-    reliability_loss(distribution, scores, near, torch.ones(1, 1), torch.ones(1, 1)).backward()
+    reliability_loss(
+        distribution, scores, near, torch.ones(1, 1), torch.ones(1, 1), torch.zeros(1)
+    ).backward()
     assert float(log_variance.grad) < 0

@@ -18,6 +18,7 @@ from utopic_cli.errors import InputError
 from utopic_cli.model.weights import load_weights
 from utopic_cli.synthesis.pairs import PairSettings, random_pair, surface_pair
 from utopic_cli.synthesis.shapes import procedural_shapes
+from utopic_cli.training import network as losses_of
 from utopic_cli.training import trainer
 from utopic_cli.training.checkpoint import read_checkpoint
 from utopic_cli.training.config import (
@@ -148,6 +149,24 @@ def test_one_pair_can_be_learnt_by_heart(shapes):
         optimiser.step()
         losses.append(float(loss.detach()))
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+
+
+def test_certainty_far_from_the_overlap_is_learnt_where_a_right_transformation_is_shown(shapes, monkeypatch):
+    rng = np.random.default_rng(3)
+    sample = sample_pair(random_pair(shapes, rng, PairSettings()), 80, rng)
+    pair = to_training_pair(sample, CONFIG.model.neighbours)
+    seen = []
+    learn = losses_of.reliability_loss
+    monkeypatch.setattr(losses_of, "reliability_loss", lambda *given: seen.append(given[-1]) or learn(*given))
+    network = TrainingNetwork(CONFIG.model)
+    right = pair.gt_T_target_source.clone()
+    near, wrong = right.clone(), right.clone()
+    near[:, :3, 3] += pair.source.spacing
+    wrong[:, :3, 3] += 10.0 * pair.source.spacing
+    for shown, present, expected in ((right, 1, 1), (near, 1, 1), (wrong, 1, 0), (right, 0, 0)):
+        given = pair._replace(hypothesis=shown, hypothesis_present=torch.tensor([float(present)]))
+        network.joint_stage(given, torch.Generator().manual_seed(0), masking=False, completion=False)
+        assert [each.tolist() for each in seen[-2:]] == [[expected], [expected]]
 
 
 def test_the_papers_setting_takes_a_step(shapes):

@@ -60,7 +60,7 @@ class Answer:
         pose: how far it is off, or None.
         matches: of the view that the answer rests on; None for the floor and for methods.
         first_overlap: overlap told without a transformation; None from who tells none.
-        final_overlap: overlap told when shown the answer, weighed with the solve's odds that it is right.
+        final_overlap: overlap told from the answer, weighed with the solve's odds that it is right.
         first_uncertainty: raw uncertainty by place at the first look; None from who tells no overlap.
         final_uncertainty: the same when shown the answer.
         score: the solver's score of it.
@@ -214,7 +214,8 @@ class _Desk:
             if matcher.looks_again:
                 with _cpu(seconds, "look_again"):
                     normalised = look.prepared.normalise(T)
-                    again = matcher.look(look.prepared, normalised, look.estimate.odds)
+                    odds = look.estimate.odds
+                    again = matcher.look_again(look.prepared, look.view, normalised, odds)
             for name, view in (("first", look.view), ("final", again)):
                 told[f"{name}_overlap"] = measure_overlap(view, self._known)
                 told[f"{name}_uncertainty"] = measure_uncertainty(look.prepared, view, self._known)

@@ -47,10 +47,14 @@ class Fpfh:
             "open3d": load_open3d().__version__,
         }
 
-    def look(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, odds: float | None = None
+    def look_again(
+        self, prepared: PreparedPair, first: NetworkView, hypothesis: np.ndarray, odds: float
     ) -> NetworkView:
-        """Return its view of a prepared pair; a transformation changes nothing."""
+        """Return its first view: a transformation changes nothing."""
+        return first
+
+    def look(self, prepared: PreparedPair) -> NetworkView:
+        """Return its view of a prepared pair."""
         features = [_node_features(cloud, prepared.spacing) for cloud in (prepared.source, prepared.target)]
         scores = dual_softmax(features[0] @ features[1].T)
         n, m = scores.shape

@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from utopic_cli.benchmark.held_out import made_of
-from utopic_cli.benchmark.pair_metrics import known_nodes, measure_pose
+from utopic_cli.benchmark.pair_metrics import SUCCESS, known_nodes, measure_pose
 from utopic_cli.benchmark.protocols import AnyProtocol, CropProtocol, RangeProtocol
 from utopic_cli.benchmark.trials import trial
-from utopic_cli.bridge import load_network, predict
+from utopic_cli.bridge import gaps, load_network, predict
 from utopic_cli.estimation.candidates import Candidate
 from utopic_cli.estimation.close_up import close_ups
 from utopic_cli.estimation.prior import Prior
 from utopic_cli.estimation.problem import Problem
 from utopic_cli.estimation.solver import solve
+from utopic_cli.geometry import rigid
 from utopic_cli.look import problem_of
-from utopic_cli.model.pose_verifier import overlap_logits
 from utopic_cli.point_cloud import PointCloud
 from utopic_cli.preprocess import PreparedPair, prepare
 from utopic_cli.synthesis.scan_pair import DegeneratePair, ScanPair
@@ -68,8 +68,8 @@ class Lesson:
         proposed: (C,) whether the solve came upon it; False for what the known answer is drawn to, which is
             among them where the solve missed it.
         by_surfaces: (C,) its standing by the surfaces alone.
-        overlap: (N,) what the network makes of the pair's points when shown a right pose that was proposed,
-            as logits; empty without one, and but for every fourth pair.
+        gap: (N,) how far the pair's points are from the other scan under a right pose (not by symmetry)
+            that was proposed, in node spacings; empty without one, and but for every fourth pair.
         overlaps: (N,) whether they overlap; empty but for every fourth pair.
     """
 
@@ -80,7 +80,7 @@ class Lesson:
     right: np.ndarray
     proposed: np.ndarray
     by_surfaces: np.ndarray
-    overlap: np.ndarray
+    gap: np.ndarray
     overlaps: np.ndarray
 
 
@@ -136,20 +136,20 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
         return None
     if estimate.shared_points:
         return None
-    candidates = [estimate.best, *estimate.rivals]
+    proposals = candidates = [estimate.best, *estimate.rivals]
     right = [question.right(prepared.denormalise(each.T_target_source)) for each in candidates]
     proposed = [True] * len(candidates)
     if question.answer is not None and not any(right):
         missed = _missed(problem, prepared, question)
-        candidates += missed
+        candidates = [*candidates, *missed]
         right += [True] * len(missed)
         proposed += [False] * len(missed)
-    overlap, overlaps = np.zeros(0), np.zeros(0, bool)
+    gap, overlaps = np.zeros(0), np.zeros(0, bool)
     if number % OVERLAP_EVERY == 0:
         overlaps = _overlaps(prepared, question)
-        if any(right) and proposed[right.index(True)]:
-            again = predict(model, prepared, 0, candidates[right.index(True)].T_target_source)
-            overlap = overlap_logits(np.concatenate([again.source_overlap, again.target_overlap]))
+        known = next((each for each in proposals if _as_known(prepared, each, question)), None)
+        if known is not None:
+            gap = np.concatenate(gaps(prepared, known.T_target_source))
     shown = close_ups(problem, candidates)
     return Lesson(
         question.kind,
@@ -159,8 +159,18 @@ def lesson_of(weights: str, shapes: ShapeLibrary, data: str, seed: int, number: 
         np.array(right),
         np.array(proposed),
         np.array([each.standing for each in candidates]),
-        overlap.astype(np.float32),
+        gap.astype(np.float32),
         overlaps,
+    )
+
+
+def _as_known(prepared: PreparedPair, candidate: Candidate, question: Question) -> bool:
+    """Tell whether a candidate is right, and not by symmetry: overlap is known of the known answer."""
+    T = prepared.denormalise(candidate.T_target_source)
+    return (
+        question.answer is not None
+        and question.right(T)
+        and rigid.relative_rotation_error_deg(T, question.answer) < SUCCESS[0]
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from utopic_cli.benchmark.fpfh import Fpfh
 from utopic_cli.benchmark.open3d_methods import load_open3d
-from utopic_cli.bridge import NetworkView, load_network, predict, read_overlap
+from utopic_cli.bridge import NetworkView, load_network, predict, weigh
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.preprocess import PreparedPair
 
@@ -40,15 +40,20 @@ class Matcher(Protocol):
         """Return everything needed to repeat it, JSON-ready."""
         ...
 
-    def look(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, odds: float | None = None
+    def look(self, prepared: PreparedPair) -> NetworkView:
+        """Say what it sees at first."""
+        ...
+
+    def look_again(
+        self, prepared: PreparedPair, first: NetworkView, hypothesis: np.ndarray, odds: float
     ) -> NetworkView:
-        """Say what it sees, shown a (4, 4) transformation of the normalised clouds or none.
+        """Say what it sees once it is shown a transformation.
 
         Args:
             prepared: the pair.
-            hypothesis: the transformation.
-            odds: log-odds that it is right; None: overlap stays as the network gives it.
+            first: what it saw at first.
+            hypothesis: (4, 4) between the normalised clouds.
+            odds: log-odds that it is right.
         """
         ...
 
@@ -85,12 +90,15 @@ class Network:
             "device": str(next(self.model.parameters()).device),
         }
 
-    def look(
-        self, prepared: PreparedPair, hypothesis: np.ndarray | None = None, odds: float | None = None
-    ) -> NetworkView:
+    def look(self, prepared: PreparedPair) -> NetworkView:
         """Run the network."""
-        view = predict(self.model, prepared, self.seed, hypothesis)
-        return view if odds is None else read_overlap(self.model, view, odds)
+        return predict(self.model, prepared, self.seed)
+
+    def look_again(
+        self, prepared: PreparedPair, first: NetworkView, hypothesis: np.ndarray, odds: float
+    ) -> NetworkView:
+        """Run it once more, and weigh what it sees."""
+        return weigh(self.model, first, predict(self.model, prepared, self.seed, hypothesis), odds)
 
 
 def load_matchers(

@@ -20,7 +20,7 @@ from utopic_cli.benchmark.pool import each
 from utopic_cli.errors import InputError
 from utopic_cli.estimation.close_up import NODES, POINT_FEATURES, WHOLE_FEATURES
 from utopic_cli.estimation.confidence import fit_calibration
-from utopic_cli.model.pose_verifier import PoseVerifier
+from utopic_cli.model.pose_verifier import UNREAD, PoseVerifier, meeting
 from utopic_cli.synthesis.shapes import ShapeLibrary
 
 WIDTH = 64
@@ -115,7 +115,7 @@ def learn(
         "out_of_fold": _chosen(held),
     }
     verifier = fit(lessons, seed)
-    verifier.reading.copy_(torch.from_numpy(reading_of(lessons)))
+    verifier.overlap.copy_(torch.from_numpy(reading_of(lessons)))
     return verifier, {**description, "overlap": _told(verifier, lessons)}
 
 
@@ -155,38 +155,38 @@ def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
 
 
 def reading_of(lessons: Sequence[Lesson]) -> np.ndarray:
-    """Fit how to read overlap (3,); see ``PoseVerifier``.
+    """Fit how to read overlap from a pose (3,), by maximum likelihood; see ``PoseVerifier``.
 
-    Slope and shift are 1 and 0 where fewer than ``FEWEST_SHOWN`` pairs were shown with a right pose, or these
-    show no overlap, or nothing else, or less of it the more the network gives.
+    Slope and shift are those of a verifier that learned nothing where fewer than ``FEWEST_SHOWN`` pairs have
+    a right pose, or their points overlap all or not at all, or none the more the nearer the other scan is.
     """
-    without = [lesson.overlaps.mean() for lesson in lessons if len(lesson.overlaps) > len(lesson.overlap)]
+    without = [lesson.overlaps.mean() for lesson in lessons if len(lesson.overlaps) > len(lesson.gap)]
     usual = float(np.mean(without)) if without else 0.0
-    as_it_is = np.array([1.0, 0.0, usual])
-    logits, overlaps = _shown(lessons)
-    if sum(bool(len(one.overlap)) for one in lessons) < FEWEST_SHOWN or not overlaps.any() or overlaps.all():
-        return as_it_is
-    model = fit_calibration(("logit",), logits[:, None].astype(np.float64), overlaps, threshold=0.5)
+    unread = np.array([*UNREAD[:2], usual])
+    met, overlaps = _shown(lessons)
+    if sum(bool(len(one.gap)) for one in lessons) < FEWEST_SHOWN or not overlaps.any() or overlaps.all():
+        return unread
+    model = fit_calibration(("met",), met[:, None], overlaps, threshold=0.5)
     slope = model.coefficients[0] / model.deviation[0]
-    return np.array([slope, model.intercept - slope * model.mean[0], usual]) if slope > 0 else as_it_is
+    return np.array([slope, model.intercept - slope * model.mean[0], usual]) if slope > 0 else unread
 
 
 def _shown(lessons: Sequence[Lesson]) -> tuple[np.ndarray, np.ndarray]:
-    """Overlap logits (N,) of all lessons in which the network was shown a right pose, and what is true."""
-    shown = [lesson for lesson in lessons if len(lesson.overlap)]
+    """How far the points (N,) of all lessons with a right pose meet the other scan, and what is true."""
+    shown = [lesson for lesson in lessons if len(lesson.gap)]
     if not shown:
         return np.zeros(0), np.zeros(0, bool)
-    return np.concatenate([one.overlap for one in shown]), np.concatenate([one.overlaps for one in shown])
+    gap = np.concatenate([one.gap for one in shown]).astype(np.float64)
+    return meeting(gap), np.concatenate([one.overlaps for one in shown])
 
 
 def _told(verifier: PoseVerifier, lessons: Sequence[Lesson]) -> dict[str, float]:
-    """Describe how overlap is read, and the share of points told right before and after."""
-    logits, overlaps = _shown(lessons)
-    slope, shift, usual = verifier.reading.tolist()
-    counted = {"slope": slope, "shift": shift, "usual_without_a_right_pose": usual, "points": len(logits)}
-    if len(logits):
-        counted["accuracy_as_it_is"] = float(((logits > 0) == overlaps).mean())
-        counted["accuracy"] = float(((slope * logits + shift > 0) == overlaps).mean())
+    """Describe how overlap is read, and the share of points told right."""
+    met, overlaps = _shown(lessons)
+    slope, shift, usual = verifier.overlap.tolist()
+    counted = {"slope": slope, "shift": shift, "usual_without_a_right_pose": usual, "points": len(met)}
+    if len(met):
+        counted["accuracy"] = float(((slope * met + shift > 0) == overlaps).mean())
     return counted
 
 

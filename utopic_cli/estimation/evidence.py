@@ -159,7 +159,7 @@ def collect_evidence(
         stiffness=stiffness(source, target, transformation, twists, alike),
         seen_overlap=inside,
         seen_contrast=inside - outside,
-        uncertainty=float(seen.uncertainty[met].mean() if met.any() else seen.uncertainty.mean()),
+        uncertainty=float(seen.uncertainty[met].mean()) if met.any() else MOST_UNCERTAIN,
         residual=_spread_of_residuals(median, high),
         spread=spread,
         shared=float(estimate.shared_points),
@@ -180,6 +180,7 @@ MOST_MARGIN = 1.0
 NO_MARGIN = 0.005
 NO_CONFLICT = 0.003
 NO_OVERLAP = 0.01
+MOST_UNCERTAIN = 0.25  # the largest variance of what lies in [0, 1]
 
 
 def _smallest_eigenvalue(twists: Twists | None) -> float:

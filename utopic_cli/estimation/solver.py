@@ -19,6 +19,7 @@ from utopic_cli.estimation.candidates import (
 )
 from utopic_cli.estimation.close_up import CloseUp, close_ups
 from utopic_cli.estimation.consensus import Hypothesis, consensus_hypotheses, distinct
+from utopic_cli.estimation.constellation import alike
 from utopic_cli.estimation.correspondences import (
     candidate_correspondences,
     linear_assignment,
@@ -32,6 +33,7 @@ from utopic_cli.result import Correspondences
 
 CONSENSUS_TOLERANCE = 2.5  # voxels
 PARTNERS_TOLERANCE = 2.0  # reaches
+ALIKE = 1000  # pairs of points that look alike which are asked
 PROPOSED = 200
 FIRST = 40  # tried first; the rest only where none of these fits beyond doubt
 BEYOND_DOUBT = 0.5  # score
@@ -228,15 +230,30 @@ class _SharedPoints:
     def near(
         self, hypotheses: list[Hypothesis], correspondences: Correspondences | None = None
     ) -> list[Candidate]:
-        """Return what shares points near hypotheses, or else near what correspondences agree on closely.
+        """Return what shares points near hypotheses, or else near what points agree on that look alike.
 
-        Partners match exactly, which hypotheses about surfaces don't ask for.
+        Partners match exactly, which hypotheses about surfaces don't ask for. In grids all points look alike:
+        there the correspondences have to do.
         """
         found = self._near(hypotheses)
-        if not found and correspondences is not None and self.coincidence.reach > 0:
-            tolerance = PARTNERS_TOLERANCE * self.coincidence.reach
-            found = self._near(_consensus(self.problem, correspondences, tolerance, self.prior, FIRST))
+        reach = self.coincidence.reach
+        if not found and correspondences is not None and reach > 0:
+            tolerance = PARTNERS_TOLERANCE * reach
+            if self.coincidence.regular:
+                closely = _consensus(self.problem, correspondences, tolerance, self.prior, FIRST)
+            else:
+                closely = self._agreeing(tolerance)
+            found = self._near(closely)
         return found
+
+    def _agreeing(self, tolerance: float) -> list[Hypothesis]:
+        """Propose what points that look alike agree on; without normals, whose sides are guessed."""
+        source, target = self.problem.source_nodes, self.problem.target_nodes
+        pairs = candidate_correspondences(alike(source, target, 2.0 * self.coincidence.reach), limit=ALIKE)
+        if len(pairs) < 3:
+            return []
+        ours, theirs = source[pairs.source_indices], target[pairs.target_indices]
+        return consensus_hypotheses(ours, theirs, pairs.weights, tolerance, FIRST, prior=self.prior)
 
     def _near(self, hypotheses: list[Hypothesis]) -> list[Candidate]:
         if not hypotheses:

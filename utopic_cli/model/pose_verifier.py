@@ -3,14 +3,15 @@
 Not in the paper. Matches propose several poses, and averages over the surfaces choose among them badly
 where a half turn fits nearly as well. This small set network (in the manner of PointNet: the same layers for
 every point, then pooling) learned on right and wrong poses that the solve had proposed for simulated pairs.
-With it comes how to read the overlap that the network gives when it is shown a pose.
+With it comes how to read overlap from a pose: where it is right, whether the other scan comes near tells more
+than the network, which was also shown poses that are not.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.special import expit, logit
+from scipy.special import expit
 from torch import Tensor, nn
 
 from utopic_cli.model.one_thread import one_thread
@@ -20,14 +21,25 @@ LARGEST = 5.0
 
 POOLS = 4
 
+MEETING_REACH = 1.1
+"""Distance, in node spacings, within which the other scan shows the same piece of surface."""
 
-CERTAIN = 1e-4
-"""Overlap is taken to be no surer than this."""
+STEEPNESS = 6.0
+
+UNREAD = (8.0, -4.0, 0.0)
+"""How overlap is read by a verifier that has learned nothing: even at ``MEETING_REACH``."""
 
 
-def overlap_logits(overlap: np.ndarray) -> np.ndarray:
-    """Return probabilities (N,) as finite logits."""
-    return np.asarray(logit(np.clip(overlap, CERTAIN, 1.0 - CERTAIN)))
+def meeting(gap: np.ndarray) -> np.ndarray:
+    """Tell how far points meet the other scan (N,): 1 upon it, half at ``MEETING_REACH``, 0 away from it.
+
+    A point overlaps if the other scan comes within that reach, which under a right pose can be seen. Under
+    one a little off it can't quite, so the step is soft.
+
+    Args:
+        gap: (N,) distance to the other scan's nearest node, in node spacings.
+    """
+    return np.asarray(1.0 / (1.0 + (gap / MEETING_REACH) ** STEEPNESS))
 
 
 class PoseVerifier(nn.Module):
@@ -35,15 +47,15 @@ class PoseVerifier(nn.Module):
 
     Attributes:
         sizes: the arguments that it was built with.
-        reading: (3,) how to read overlap: slope and shift that turn the network's logits, shown a right
-            pose, into log-odds, and the share that overlaps where no right pose was found.
+        overlap: (3,) how to read overlap from a pose: slope and shift that turn how far a point meets the
+            other scan under a right pose into log-odds, and the share that overlaps where none was found.
     """
 
     point_mean: Tensor
     point_scale: Tensor
     whole_mean: Tensor
     whole_scale: Tensor
-    reading: Tensor
+    overlap: Tensor
 
     def __init__(self, point_features: int, whole_features: int, width: int) -> None:
         """Build with random weights.
@@ -58,7 +70,7 @@ class PoseVerifier(nn.Module):
         for name, count in (("point", point_features), ("whole", whole_features)):
             self.register_buffer(f"{name}_mean", torch.zeros(count))
             self.register_buffer(f"{name}_scale", torch.ones(count))
-        self.register_buffer("reading", torch.tensor([1.0, 0.0, 0.0]))
+        self.register_buffer("overlap", torch.tensor(UNREAD))
         self.points = nn.Sequential(
             nn.Linear(point_features, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
         )
@@ -78,18 +90,19 @@ class PoseVerifier(nn.Module):
             getattr(self, f"{name}_mean").copy_(flat.mean(dim=0))
             getattr(self, f"{name}_scale").copy_(flat.std(dim=0) + 1e-3)
 
-    def read(self, overlap: np.ndarray, odds: float) -> np.ndarray:
-        """Return probabilities of overlap (N,) where the network was shown a pose.
+    def read_overlap(self, gap: np.ndarray, odds: float) -> np.ndarray:
+        """Return probabilities of overlap (N,) under a pose.
 
-        What it then sees holds if the pose is right; if it is not, nothing is known but what is usual then.
+        Where the scans meet under it holds if it is right; if it is not, nothing is known but what is usual
+        then.
 
         Args:
-            overlap: (N,) the network's.
+            gap: (N,) as of ``meeting``, under that pose.
             odds: log-odds that the pose is right.
         """
-        slope, shift, usual = self.reading.tolist()
+        slope, shift, usual = self.overlap.tolist()
         right = expit(odds)
-        return np.asarray(right * expit(slope * overlap_logits(overlap) + shift) + (1.0 - right) * usual)
+        return np.asarray(right * expit(slope * meeting(gap) + shift) + (1.0 - right) * usual)
 
     @one_thread()
     def forward(self, points: Tensor, whole: Tensor) -> Tensor:

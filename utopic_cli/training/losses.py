@@ -16,6 +16,9 @@ from utopic_cli.training.labels import Labels
 EVEN_VARIANCE = 0.02
 """Raw uncertainty of a point that is as likely matched rightly as wrongly."""
 
+FAR_WEIGHT = 0.3
+"""What a point far from any counterpart counts, beside one near one: there are many, and all alike."""
+
 
 def descriptor_loss(similarity: Tensor, temperature: Tensor, labels: Labels) -> Tensor:
     """Symmetric InfoNCE within a pair, over the points that have a counterpart.
@@ -75,15 +78,21 @@ def uncertainty_loss(
 
 
 def reliability_loss(
-    distribution: OverlapDistribution, scores: Tensor, near: Tensor, overlap: Tensor, valid: Tensor
+    distribution: OverlapDistribution,
+    scores: Tensor,
+    near: Tensor,
+    overlap: Tensor,
+    valid: Tensor,
+    shown: Tensor,
 ) -> Tensor:
     """Teach the raw uncertainty to tell points that are matched wrongly: cross entropy of its odds.
 
     The paper's loss leaves the variance of a sure point to the Kullback-Leibler term, so that it
     follows the mean and says little of its own. Here the variance over ``EVEN_VARIANCE`` is read as the odds
     that the point's best match is wrong: it has to be high where the surface shows nothing to go
-    by, and at the border, where a counterpart is near but none is right. Points far from any counterpart
-    take no part: about their match there is nothing to know.
+    by, and at the border, where a counterpart is near but none is right. A point far from any counterpart
+    has no match to be wrong: where the right transformation shows as much it should be low there. Otherwise
+    nothing tells it from a point that can't be matched, and it takes no part.
 
     Args:
         distribution: of one cloud, N points and K samples.
@@ -91,12 +100,14 @@ def reliability_loss(
         near: (B, N, M) bool, pairs of real points that show about the same place.
         overlap: (B, N) in {0, 1}.
         valid: (B, N) float, 0 for points that only fill a batch up.
+        shown: (B,) 1 where the network was shown the right transformation or nearly, else 0.
     """
     best = scores.detach().argmax(dim=2, keepdim=True)
-    wrong = 1.0 - near.gather(2, best)[:, :, 0].float() * overlap
+    reached = near.any(dim=2).float()
+    wrong = reached * (1.0 - near.gather(2, best)[:, :, 0].float() * overlap)
     odds = (distribution.raw_uncertainty.clamp_min(1e-6) / EVEN_VARIANCE).log()
     terms = binary_cross_entropy_with_logits(odds, wrong, reduction="none")
-    return _mean(terms, near.any(dim=2).float() * valid)
+    return _mean(terms, torch.maximum(reached, FAR_WEIGHT * shown[:, None]) * valid)
 
 
 def chamfer_loss(predicted: Tensor, expected: Tensor, valid: Tensor) -> Tensor:

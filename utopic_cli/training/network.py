@@ -22,6 +22,9 @@ from utopic_cli.training.losses import (
     uncertainty_loss,
 )
 
+RIGHT_WITHIN = 4.0
+"""Node spacings: a transformation is as good as right if it puts half of the points so near their place."""
+
 
 class TrainingPair(NamedTuple):
     """A batch of pairs with known answers, in normalised units.
@@ -109,7 +112,7 @@ class TrainingNetwork(nn.Module):
             + uncertainty_loss(prediction.target_distribution, labels.target_overlap, labels.target_valid),
         }
         if self.inference.config.uncertainty_scheme != "none":
-            terms["reliability"] = self._reliability_loss(prediction, labels)
+            terms["reliability"] = self._reliability_loss(prediction, labels, shown_right(pair))
         if completion:
             terms["completion"] = self._completion_loss(
                 pair, labels, prediction.source_features, forward=True
@@ -117,14 +120,19 @@ class TrainingNetwork(nn.Module):
         return terms
 
     @staticmethod
-    def _reliability_loss(prediction: Prediction, labels: Labels) -> Tensor:
+    def _reliability_loss(prediction: Prediction, labels: Labels, shown: Tensor) -> Tensor:
         """Of both clouds, by the correspondences that are found from the features that tell it."""
         scores = prediction.coarse_scores[:, :-1, :-1]
         real = (labels.source_valid[:, :, None] * labels.target_valid[:, None]) > 0
         near = real & ((labels.correspondences > 0) | labels.ignored)
         return 0.5 * (
             reliability_loss(
-                prediction.source_distribution, scores, near, labels.source_overlap, labels.source_valid
+                prediction.source_distribution,
+                scores,
+                near,
+                labels.source_overlap,
+                labels.source_valid,
+                shown,
             )
             + reliability_loss(
                 prediction.target_distribution,
@@ -132,6 +140,7 @@ class TrainingNetwork(nn.Module):
                 near.transpose(1, 2),
                 labels.target_overlap,
                 labels.target_valid,
+                shown,
             )
         )
 
@@ -161,3 +170,11 @@ def total_loss(terms: dict[str, Tensor], weights: LossWeights) -> Tensor:
     """Weigh and add the loss terms that are present."""
     weighed = weights._asdict()
     return torch.stack([weighed[name] * term for name, term in terms.items()]).sum()
+
+
+def shown_right(pair: TrainingPair) -> Tensor:
+    """Tell which pairs are shown the right transformation, or one that is off by little -> (B,) in {0, 1}."""
+    offset = pair.hypothesis - pair.gt_T_target_source  # (B, 4, 4)
+    shifts = pair.source.points @ offset[:, :3, :3].transpose(1, 2) + offset[:, None, :3, 3]
+    near = shifts.norm(dim=2).median(dim=1).values < RIGHT_WITHIN * pair.source.spacing
+    return pair.hypothesis_present * near

@@ -68,5 +68,6 @@ def joined_processes(device: torch.device) -> Iterator[Processes]:
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:
         yield Processes(dist.get_rank(), count)
+        dist.barrier()  # whoever left first would break the others' connections while they still work
     finally:
         dist.destroy_process_group()
