@@ -19,6 +19,7 @@ from utopic_cli.geometry import rigid
 from utopic_cli.geometry.nearest import nearest, search_threads
 from utopic_cli.model.cloud_input import CloudInput
 from utopic_cli.model.pose_verifier import PoseVerifier
+from utopic_cli.model.uncertainty import normalise_uncertainty
 from utopic_cli.model.utopic import EncodedCloud, Prediction, Utopic
 from utopic_cli.model.weights import choose_device, load_weights
 from utopic_cli.preprocess import PreparedPair, SampledCloud
@@ -172,17 +173,15 @@ def weigh(model: Utopic, first: NetworkView, shown: NetworkView, odds: float) ->
     right = float(expit(odds))
     source_raw = right * shown.source_raw + (1.0 - right) * first.source_raw
     target_raw = right * shown.target_raw + (1.0 - right) * first.target_raw
-    lowest = min(source_raw.min(), target_raw.min())
-    span = max(source_raw.max(), target_raw.max()) - lowest
-    scale = 1.0 / span if span > 1e-9 else 0.0  # as in normalise_uncertainty
+    normalised = normalise_uncertainty(*(torch.from_numpy(raw)[None] for raw in (source_raw, target_raw)))
     return replace(
         shown,
         source_overlap=verifier.read_overlap(shown.source_gap, odds),
         target_overlap=verifier.read_overlap(shown.target_gap, odds),
         source_raw=source_raw,
         target_raw=target_raw,
-        source_uncertainty=scale * (source_raw - lowest),
-        target_uncertainty=scale * (target_raw - lowest),
+        source_uncertainty=_array(normalised[0]),
+        target_uncertainty=_array(normalised[1]),
     )
 
 
