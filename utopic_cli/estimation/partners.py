@@ -8,10 +8,11 @@ which of two symmetric poses it is. Whether partners exist can be read off the d
 
 from __future__ import annotations
 
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import rel_entr
 
 from utopic_cli.estimation.procrustes import weighted_procrustes
 from utopic_cli.geometry import rigid
@@ -25,33 +26,45 @@ REGULAR = 2.2
 surface, still 2.5 where it is thin and noisy, 1.4 on a square grid."""
 
 NEAR = 4.0
-"""A point takes part if the other cloud comes within this many reaches."""
+"""Of grids and even samples: a point takes part if the other cloud comes within this many reaches."""
 
-SPREADS = (1.0, 1.6, 2.5)
-"""Distances, in reaches, within which partners are looked for: how large the jitter is nobody says. Farther
-off, how the surface lies counts for more than the points on it."""
+SPREADS = (0.4, 0.63, 1.0, 1.6, 2.5)
+"""Standard deviations, in reaches, of what lies between partners along an axis: how large the jitter is
+nobody says."""
 
-RING = (1.5, 2.5)
-"""What lies this far off, in multiples of the distance, tells how many points chance brings near."""
+WIDE = 4.0
+"""Deviation, in reaches, at which points of thinned clouds crowd as those of others do."""
 
-BEYOND_CHANCE = 5.5
-"""Standard deviations above chance from which on partners are believed. Of 50,000 transformations tried for
-620 pairs of samples of their own the best had 4.6."""
+TAIL = 2.8
+"""Deviations beyond which a point does not count."""
 
-REGULARLY_BEYOND = 6.5
+SHARES = (0.15, 0.4, 0.8)
+"""Of the points that are near the other cloud, how many may have a partner."""
+
+BEYOND_CHANCE = 12.0
+"""Log-likelihood ratio, in nats, from which on partners are believed. Of 13,000 transformations tried for
+300 pairs of samples of their own the best had 6.9."""
+
+REGULARLY_BEYOND = 21.0
 """The same for grids and even samples, by the bound there is for them."""
 
-WORTH_A_FIT = 2.5
-"""Standard deviations above chance from which on it is seen what a fit makes of them."""
+OF_THE_BEST = 0.5
+"""Share of the best transformation's evidence that another needs: half a turn that lays points on each other
+does it to both of a pair, so that chance counts twice."""
 
-FEWEST_NEAR = 30  # points
-FEWEST_PAIRS = 60
-UNSEEN = 4.0  # pairs that few points may not show by chance
-EVENLY, SCATTERED = (1.0 / (RING[1] ** n - RING[0] ** n) for n in (2, 3))
-"""What lies within the distance over what lies in the ring, on a surface and in space. The points of a cloud
-that shows less keep their distance (it was thinned); those of two clouds don't from each other."""
+WORTH_A_FIT = -4.0
+"""From which on it is seen what a fit makes of them."""
+
+FEWEST_NEAR = 20  # points
+FEWEST_OTHERS = 0.1
+"""Least that chance is taken to bring near a point: a lonely point is no evidence."""
+
+OTHERS = 24  # nearest points that are looked at
+OWN_OTHERS = 40
+SMOOTHED = 16
+"""Points over which it is averaged how they crowd."""
+
 SLACK = 0.1
-CANDIDATES = 6
 STEPS = 40
 
 
@@ -73,11 +86,13 @@ def _reach(tree: cKDTree) -> tuple[float, bool]:
 class Coincidence:
     """How far beyond chance points of two clouds coincide under a transformation.
 
-    Of random samples the pairs of points within a distance are counted, one of each cloud. How many of them
-    chance brings follows from the pairs in a ring around it: their ratio is that within either cloud, whose
-    own points come near each other by chance only. It is taken where the clouds meet: along a pole it is
-    another than on the flag. In grids and even samples points don't come near each other at all; there it is
-    counted how many are each other's nearest within the reach.
+    Each point that has others near it speaks for partners or for chance. If it has a partner, that lies where
+    a Gaussian has it; what chance brings near follows from how the points of either cloud crowd there, since
+    they come near each other by chance only. The likelihood ratio of the two is what there is of near points,
+    weighed by the Gaussian, over what chance brings: 1 on average without partners. Not every point has one.
+
+    In grids and even samples points don't come near each other at all; there it is counted how many are
+    each other's nearest within the reach.
 
     Attributes:
         source: (N, 3) points.
@@ -94,33 +109,24 @@ class Coincidence:
         found = [_reach(tree) for tree in trees]
         self.reach = 0.0 if any(reach == 0 for reach, _ in found) else max(reach for reach, _ in found)
         self.regular = any(regular for _, regular in found)
-        radii = self.reach * np.outer((1.0, *RING), () if self.regular else SPREADS).T
-        self._rings = [_Ring(each, trees) for each in radii]
+        self._deviations = self.reach * np.array(SPREADS)
+        self._crowding = [_crowding(tree, self._deviations) for tree in trees] if self.reach > 0 else []
+
+    @property
+    def enough(self) -> float:
+        """Evidence from which on partners are believed, in nats."""
+        return REGULARLY_BEYOND if self.regular else BEYOND_CHANCE
 
     def evidence(self, transformations: np.ndarray) -> np.ndarray:
-        """Standard deviations above chance under (H, 4, 4) T_target_source -> (H,).
+        """Log-likelihood ratio of partners to chance, in nats, under (H, 4, 4) T_target_source -> (H,).
 
-        Near 0 or below for clouds sampled each on its own, above ``BEYOND_CHANCE`` where partners meet; -inf
-        where hardly a point is near.
+        Below 0 for clouds sampled each on its own, above ``enough`` where partners meet; -inf where hardly a
+        point is near.
         """
         if not self.reach > 0:
             return np.full(len(transformations), -np.inf)
-        beyond = self._mutual_beyond_chance if self.regular else self._pairs_beyond_chance
+        beyond = self._evenly_beyond_chance if self.regular else self._beyond_chance
         return np.array([beyond(T) for T in transformations], dtype=np.float64)
-
-    def _pairs_beyond_chance(self, T: np.ndarray) -> float:
-        moved = cKDTree(rigid.apply(T, self.source))
-        widest = self._rings[-1].radii[-1]
-        there, _ = self._trees[1].query(moved.data, distance_upper_bound=widest)
-        back, _ = moved.query(self.target, distance_upper_bound=widest)
-        return max(ring.beyond_chance(moved, there, back) for ring in self._rings)
-
-    def _mutual_beyond_chance(self, T: np.ndarray) -> float:
-        _, _, distance, near = _mutual(self.source, self.target, T, *self._trees, NEAR * self.reach)
-        if near < FEWEST_NEAR:
-            return -np.inf
-        close = np.count_nonzero(distance < self.reach)
-        return float((close - BY_CHANCE * near) / np.sqrt(BY_CHANCE * (1 - BY_CHANCE) * near))
 
     def meet(self, transformations: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
         """Look for transformations under which partners meet, near some of (H, 4, 4).
@@ -134,123 +140,154 @@ class Coincidence:
         begun = begun[evidence[begun] > WORTH_A_FIT]
         if not len(begun):
             return transformations[:0], begun
-        fitted = np.stack(
-            [fit_partners(self.source, self.target, transformations[i], self.reach) for i in begun]
-        )
+        fitted = np.stack([self.fit(transformations[i]) for i in begun])
         evidence = self.evidence(fitted)
         order = np.argsort(-evidence, kind="stable")
-        order = order[evidence[order] > (REGULARLY_BEYOND if self.regular else BEYOND_CHANCE)]
+        order = order[evidence[order] > max(self.enough, OF_THE_BEST * evidence[order[0]])]
         return fitted[order], begun[order]
 
+    def fit(self, T: np.ndarray) -> np.ndarray:
+        """Fit a transformation to the partners of clouds that share points.
 
-class _Ring:
-    """Pairs of points within a distance, and in a ring around it."""
-
-    def __init__(self, radii: np.ndarray, trees: tuple[cKDTree, cKDTree]) -> None:
-        """Take the distance and the ring's two radii (3,), and the clouds."""
-        self.radii, self.trees = radii, trees
-
-    def beyond_chance(self, moved: cKDTree, there: np.ndarray, back: np.ndarray) -> float:
-        """Standard deviations by which pairs within the distance exceed what chance brings; -inf for few.
+        Where the jitter is not small beside the points' distances, the nearest neighbour is often not the
+        partner. So expectation maximisation: each point is spread over its near ones and over having no
+        partner by their likelihoods, normalised both ways, Procrustes on the expected partners follows, and
+        the jitter and the share of points with a partner are estimated anew.
 
         Args:
-            moved: the source under some transformation.
-            there: (N,) distances of its points to the target, inf for far ones.
-            back: (M,) distances of the target's points to it, likewise.
+            T: (4, 4) T_target_source to start from, right within a few reaches.
+
+        Returns:
+            (4, 4) float64 T_target_source; the given one where hardly a point is near.
         """
-        close, inner, outer = moved.count_neighbors(self.trees[1], self.radii)
-        if outer < FEWEST_PAIRS:
-            return -np.inf
-        near = [counts[far < self.radii[-1]] for counts, far in zip(self._own, (there, back), strict=True)]
-        own_close, own_inner, own_outer = np.sum([counts.sum(axis=0) for counts in near], axis=0)
-        seen = own_close + UNSEEN  # each pair from both its ends
-        share = seen / max(own_outer - own_inner, 1)
-        expected = (share if share > SCATTERED else EVENLY) * (outer - inner)
-        # Pairs that share a point come and go together; and what chance brings is itself counted.
-        crowd = own_close / sum(map(len, near))
-        variance = max(expected, 4.0) * (1.0 + crowd) + 2.0 * expected**2 / seen
-        return float((close - expected) / np.sqrt(variance))
-
-    @cached_property
-    def _own(self) -> tuple[np.ndarray, ...]:
-        """Other points of its own cloud about each point within the radii (N, 3) and (M, 3)."""
-        return tuple(
-            np.stack(
-                [tree.query_ball_point(tree.data, radius, return_length=True) - 1 for radius in self.radii],
-                axis=1,
-            )
-            for tree in self.trees
-        )
-
-
-def fit_partners(source: np.ndarray, target: np.ndarray, T: np.ndarray, reach: float) -> np.ndarray:
-    """Fit a transformation to the partners of clouds that share points.
-
-    Where the jitter is not small beside the points' distances, the nearest neighbour is often not the
-    partner. So expectation maximisation: each point is spread over its few nearest ones by the
-    likelihood of the distance, normalised both ways with some slack for points without a
-    partner, Procrustes on the expected partners follows, and the jitter is estimated anew.
-
-    Args:
-        source: (N, 3) points.
-        target: (M, 3) points, partly jittered copies of source points.
-        T: (4, 4) T_target_source to start from, right within a few reaches.
-        reach: of ``Coincidence``.
-
-    Returns:
-        (4, 4) float64 T_target_source.
-    """
-    target_tree, source_tree = cKDTree(target), cKDTree(source)
-    distance = _mutual(source, target, T, source_tree, target_tree, NEAR * reach)[2]
-    if len(distance) < 3:
+        share, jitter = SHARES[1], 0.0
+        least = 1e-6 * self.reach
+        for _ in range(STEPS):
+            moved = rigid.apply(T, self.source)
+            near = self._near(moved, 0)
+            if near is None:
+                return T
+            if not jitter:
+                jitter = self._deviations[np.argmax(_log_ratios(near.ratios(self._deviations)).max(axis=0))]
+            distance = np.where(near.distance < max(4.0 * jitter, 0.5 * self.reach), near.distance, np.inf)
+            likelihood = np.exp(-0.5 * (distance / jitter) ** 2)
+            index = np.where(np.isfinite(distance), near.index, 0)
+            alone = (1.0 - share) / share * near.by_chance(self._deviations, jitter)
+            belief = _one_to_one(likelihood, index, alone, len(self.target))
+            weight = belief.sum(axis=1)
+            mass = weight.sum()
+            expected = np.einsum("nk,nkd->nd", belief, self.target[index])
+            try:
+                T = weighted_procrustes(
+                    self.source[near.rows], expected / np.maximum(weight, 1e-300)[:, None], weight
+                )
+            except ValueError:
+                return T
+            squared = np.where(belief > 0, distance, 0.0) ** 2
+            jitter = max(float(np.sqrt((belief * squared).sum() / (3.0 * mass))), least)
+            share = float(np.clip(mass / len(weight), 0.1, 0.95))
+            if np.linalg.norm(rigid.apply(T, self.source) - moved, axis=1).max() < 1e-4 * self.reach:
+                break
         return T
-    jitter = float(np.median(distance)) / 1.54  # of a coordinate, if the distance is of three
-    least = 1e-6 * reach
-    for _ in range(STEPS):
-        jitter = max(jitter, least)
-        moved = rigid.apply(T, source)
-        bound = max(4.0 * jitter, reach / 2.0)
-        nearest = range(1, min(CANDIDATES, len(target)) + 1)
-        distance, index = target_tree.query(moved, k=nearest, distance_upper_bound=bound)
-        found = np.isfinite(distance)
-        index, distance = np.where(found, index, 0), np.where(found, distance, 0.0)
-        likelihood = np.where(found, np.exp(-0.5 * (distance / jitter) ** 2), 0.0)
-        belief = _one_to_one(likelihood, index, len(target))
-        weight = belief.sum(axis=1)
-        expected = np.einsum("nk,nkd->nd", belief, target[index]) / np.maximum(weight, 1e-300)[:, None]
-        try:
-            improved = weighted_procrustes(source, expected, weight)
-        except ValueError:
-            return T
-        step = np.linalg.norm(rigid.apply(improved, source) - moved, axis=1).max()
-        T = improved
-        jitter = float(np.sqrt((belief * distance**2).sum() / (3.0 * belief.sum())))
-        if step < 1e-4 * reach:
-            break
-    return T
+
+    def _beyond_chance(self, T: np.ndarray) -> float:
+        there = self._near(rigid.apply(T, self.source), 0)
+        back = self._near(rigid.apply(rigid.invert(T), self.target), 1)
+        if there is None or back is None:
+            return -np.inf
+        both = sum(_log_ratios(near.ratios(self._deviations)) for near in (there, back))
+        return float(np.max(both) / 2.0)
+
+    def _evenly_beyond_chance(self, T: np.ndarray) -> float:
+        source, target = self._trees
+        distance, partner = target.query(rigid.apply(T, source.data), distance_upper_bound=NEAR * self.reach)
+        near = np.flatnonzero(np.isfinite(distance))
+        if len(near) < FEWEST_NEAR:
+            return -np.inf
+        back = rigid.apply(rigid.invert(T), target.data[partner[near]])
+        mutual = near[source.query(back)[1] == near]
+        share = np.count_nonzero(distance[mutual] < self.reach) / len(near)
+        nats = len(near) * (rel_entr(share, BY_CHANCE) + rel_entr(1.0 - share, 1.0 - BY_CHANCE))
+        return float(nats if share > BY_CHANCE else -nats)
+
+    def _near(self, moved: np.ndarray, cloud: int) -> _Near | None:
+        """Look from the points of a cloud (0: the source), moved onto the other, to what is near there."""
+        other = self._trees[1 - cloud]
+        nearest = range(1, min(OTHERS, other.n) + 1)
+        distance, index = other.query(moved, nearest, distance_upper_bound=TAIL * self._deviations[-1])
+        rows = np.flatnonzero(np.isfinite(distance[:, 0]))
+        if len(rows) < FEWEST_NEAR:
+            return None
+        index = index[rows]
+        crowding = 0.5 * (self._crowding[cloud][rows] + self._crowding[1 - cloud][index[:, 0]])
+        return _Near(rows, distance[rows], index, np.maximum(crowding, FEWEST_OTHERS))
 
 
-def _mutual(
-    source: np.ndarray,
-    target: np.ndarray,
-    T: np.ndarray,
-    source_tree: cKDTree,
-    target_tree: cKDTree,
-    reach: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Mutual nearest neighbours: their rows, their distances, and how many points had any near."""
-    distance, partner = target_tree.query(rigid.apply(T, source), distance_upper_bound=reach)
-    near = np.flatnonzero(np.isfinite(distance))
-    back = rigid.apply(rigid.invert(T), target[partner[near]])
-    mutual = near[source_tree.query(back)[1] == near]
-    return mutual, partner[mutual], distance[mutual], len(near)
+@dataclass(frozen=True)
+class _Near:
+    """What lies near the points of a cloud in the other.
+
+    Attributes:
+        rows: (R,) of the points that have anything near.
+        distance: (R, K) to the nearest there, inf beyond the tail.
+        index: (R, K) which they are.
+        crowding: (R, S) what chance brings near, weighed by Gaussians of S deviations.
+    """
+
+    rows: np.ndarray
+    distance: np.ndarray
+    index: np.ndarray
+    crowding: np.ndarray
+
+    def ratios(self, deviations: np.ndarray) -> np.ndarray:
+        """Likelihood ratio (R, S) of having a partner at one of S deviations to having none."""
+        return _weighed(self.distance, deviations) / self.crowding
+
+    def by_chance(self, deviations: np.ndarray, deviation: float) -> np.ndarray:
+        """Interpolate what chance brings near (R,) for another deviation; beyond them the last one's."""
+        place = np.interp(np.log(deviation), np.log(deviations), np.arange(len(deviations)))
+        below = min(int(place), len(deviations) - 2)
+        low, high = np.log(self.crowding[:, below : below + 2]).T
+        between: np.ndarray = np.exp(low + (place - below) * (high - low))
+        return between
 
 
-def _one_to_one(likelihood: np.ndarray, index: np.ndarray, columns: int) -> np.ndarray:
-    """Normalise (N, K) likelihoods over rows and columns, with slack for points without a partner."""
+def _log_ratios(ratios: np.ndarray) -> np.ndarray:
+    """Log-likelihood ratio of all points (R, S) -> (``SHARES``, S), if a share of them has a partner."""
+    logs: np.ndarray = np.log1p(np.multiply.outer(SHARES, ratios - 1.0)).sum(axis=1)
+    return logs
+
+
+def _weighed(distance: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Weigh near points (R, K) by Gaussians of S deviations and sum them up -> (R, S)."""
+    return np.stack(
+        [np.exp(-0.5 * (distance / deviation) ** 2).sum(axis=1) for deviation in deviations], axis=1
+    )
+
+
+def _crowding(tree: cKDTree, deviations: np.ndarray) -> np.ndarray:
+    """Weigh by Gaussians of S deviations what lies near each point of a cloud in it -> (N, S), smoothed.
+
+    Where points keep their distance from each other, those of another cloud don't keep it from them: what
+    lies farther off tells how many there would be, evenly on a surface.
+    """
+    wide = WIDE / SPREADS[-1] * deviations[-1]
+    others = range(2, min(OWN_OTHERS, tree.n - 1) + 2)
+    distance = tree.query(tree.data, others, distance_upper_bound=TAIL * wide)[0]
+    weighed = _weighed(distance, np.append(deviations, wide))
+    around = tree.query(tree.data, range(1, min(SMOOTHED, tree.n) + 1))[1]
+    smoothed = weighed[around].mean(axis=1)
+    scale = deviations / wide
+    crowding, widely = smoothed[:, :-1], smoothed[:, -1:]
+    apart = crowding.mean(axis=0) < scale**3 * widely.mean()  # fewer than scattered in space
+    return np.where(apart, scale**2 * widely, crowding)
+
+
+def _one_to_one(likelihood: np.ndarray, index: np.ndarray, alone: np.ndarray, columns: int) -> np.ndarray:
+    """Normalise (N, K) likelihoods over rows, with (N,) that of no partner, and over columns, with slack."""
     column_scale: np.ndarray = np.ones(columns)
     for _ in range(8):
-        row_scale = 1.0 / (SLACK + (likelihood * column_scale[index]).sum(axis=1))
+        row_scale = 1.0 / (alone + (likelihood * column_scale[index]).sum(axis=1))
         mass = np.bincount(index.ravel(), (likelihood * row_scale[:, None]).ravel(), minlength=columns)
         column_scale = 1.0 / (SLACK + mass)
     return likelihood * row_scale[:, None] * column_scale[index]

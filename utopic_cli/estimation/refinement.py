@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from utopic_cli.estimation.partners import BEYOND_CHANCE, Coincidence, fit_partners
+from utopic_cli.estimation.partners import Coincidence
 from utopic_cli.estimation.surface import Surface, point_spacing, thinned
 from utopic_cli.geometry import rigid
 from utopic_cli.geometry.nearest import nearest
@@ -282,9 +282,9 @@ def _fit_partners(
         return None
     coincidence = Coincidence(moving.points, fixed.points)
     evidence = coincidence.evidence(transformations)
-    if not evidence.max() > BEYOND_CHANCE:
+    if not evidence.max() > coincidence.enough:
         return None
-    return fit_partners(moving.points, fixed.points, transformations[evidence.argmax()], coincidence.reach)
+    return coincidence.fit(transformations[evidence.argmax()])
 
 
 def _descend(moving: _FullSurface, fixed: _FullSurface, T: np.ndarray, reach: float) -> np.ndarray:
