@@ -52,9 +52,6 @@ OF_THE_BEST = 0.5
 """Share of the best transformation's evidence that another needs: half a turn that lays points on each other
 does it to both of a pair, so that chance counts twice."""
 
-WORTH_A_FIT = -4.0
-"""From which on it is seen what a fit makes of them."""
-
 FEWEST_NEAR = 20  # points
 FEWEST_OTHERS = 0.1
 """Least that chance is taken to bring near a point: a lonely point is no evidence."""
@@ -66,6 +63,8 @@ SMOOTHED = 16
 
 SLACK = 0.1
 STEPS = 40
+FIRST_STEPS = 10  # after which the evidence tells which fits are worth finishing
+FINISHED = 3
 
 
 def _reach(tree: cKDTree) -> tuple[float, bool]:
@@ -131,22 +130,30 @@ class Coincidence:
     def meet(self, transformations: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
         """Look for transformations under which partners meet, near some of (H, 4, 4).
 
+        Partners a few reaches apart are no evidence yet, but a fit may bring them together.
+
+        Args:
+            transformations: T_target_source, best first by what else is known.
+            most: begin at so many of the first, and at so many of those with the most evidence.
+
         Returns:
-            (K, 4, 4) T_target_source, fitted to the partners, best first, K at most ``most``; and (K,)
+            (K, 4, 4) T_target_source, fitted to the partners, best first, K at most ``FINISHED``; and (K,)
             which of the given ones each began at.
         """
         evidence = self.evidence(transformations)
-        begun = np.argsort(-evidence, kind="stable")[:most]
-        begun = begun[evidence[begun] > WORTH_A_FIT]
+        begun = np.union1d(np.argsort(-evidence, kind="stable")[:most], np.arange(len(evidence))[:most])
+        begun = begun[np.isfinite(evidence[begun])]
         if not len(begun):
             return transformations[:0], begun
-        fitted = np.stack([self.fit(transformations[i]) for i in begun])
+        fitted = np.stack([self.fit(transformations[i], FIRST_STEPS) for i in begun])
+        best = np.argsort(-self.evidence(fitted), kind="stable")[:FINISHED]
+        begun, fitted = begun[best], np.stack([self.fit(T) for T in fitted[best]])
         evidence = self.evidence(fitted)
         order = np.argsort(-evidence, kind="stable")
         order = order[evidence[order] > max(self.enough, OF_THE_BEST * evidence[order[0]])]
         return fitted[order], begun[order]
 
-    def fit(self, T: np.ndarray) -> np.ndarray:
+    def fit(self, T: np.ndarray, steps: int = STEPS) -> np.ndarray:
         """Fit a transformation to the partners of clouds that share points.
 
         Where the jitter is not small beside the points' distances, the nearest neighbour is often not the
@@ -156,13 +163,14 @@ class Coincidence:
 
         Args:
             T: (4, 4) T_target_source to start from, right within a few reaches.
+            steps: most steps.
 
         Returns:
             (4, 4) float64 T_target_source; the given one where hardly a point is near.
         """
         share, jitter = SHARES[1], 0.0
         least = 1e-6 * self.reach
-        for _ in range(STEPS):
+        for _ in range(steps):
             moved = rigid.apply(T, self.source)
             near = self._near(moved, 0)
             if near is None:
