@@ -111,6 +111,62 @@ def test_even_samples_of_their_own_do_not_pass_for_shared_points() -> None:
     assert Coincidence(source, source + 0.001).evidence(np.eye(4)[None])[0] > 2 * BEYOND_CHANCE
 
 
+def means_of_voxels(points: np.ndarray, size: float) -> np.ndarray:
+    """Thin a cloud as scanning programs do."""
+    rows = np.unique(np.floor(points / size).astype(int), axis=0, return_inverse=True)[1].ravel()
+    sums = np.stack([np.bincount(rows, points[:, axis]) for axis in range(3)], axis=1)
+    return np.asarray(sums / np.bincount(rows)[:, None])
+
+
+@pytest.mark.parametrize(("count", "noise"), [(6000, 0.0), (6000, 0.25), (1200, 0.0), (1200, 0.2)])
+def test_thinned_samples_of_their_own_do_not_pass_for_shared_points(
+    count: int, noise: float, gt_transformation: np.ndarray
+) -> None:
+    rng = np.random.default_rng(7)
+    size = 0.11
+    source, other = (
+        means_of_voxels(random_sample(count, rng) + offset, size) - offset for offset in (0.0, 0.043)
+    )
+    source, other = (cloud + noise * size * rng.normal(size=cloud.shape) for cloud in (source, other))
+    coincidence = Coincidence(source, rigid.apply(gt_transformation, other))
+    starts = np.stack([nudged(gt_transformation, source, degrees, 0.0) for degrees in np.linspace(0, 9, 10)])
+    poses = np.concatenate([starts, [coincidence.fit(T) for T in starts[:4]]])
+    assert coincidence.evidence(poses).max() < 0.5 * BEYOND_CHANCE
+    same = source + 0.05 * size * rng.normal(size=source.shape)
+    assert Coincidence(source, same).evidence(np.eye(4)[None])[0] > 5 * BEYOND_CHANCE
+
+
+def test_rods_of_even_points_do_not_pass_for_shared_points() -> None:
+    # Along a rod any place is near a point, though there are few in the space around it.
+    rod = np.column_stack([0.02 * np.arange(150), np.zeros((150, 2))])
+    poses = np.stack([rigid.rigid(np.eye(3), np.array([shift, 0.0, 0.0])) for shift in (0.003, 0.005, 0.008)])
+    coincidence = Coincidence(rod, rod)
+    assert coincidence.regular and coincidence.evidence(poses).max() < 1.0
+
+
+def test_shared_points_are_told_where_little_overlaps() -> None:
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        whole = random_sample(1000, rng)
+        along = np.argsort(whole[:, 0])
+        source, target = (
+            whole[rows] + rng.normal(0, JITTER, (len(rows), 3)) for rows in (along[500:], along[:620])
+        )
+        assert Coincidence(source, target).evidence(np.eye(4)[None])[0] > 1.5 * BEYOND_CHANCE
+
+
+def test_partners_that_are_some_reaches_apart_are_brought_together(
+    shared: tuple[np.ndarray, np.ndarray, np.ndarray], gt_transformation: np.ndarray
+) -> None:
+    source, target, _ = shared
+    coincidence = Coincidence(source, target)
+    start = nudged(gt_transformation, source, 6.0, 0.04)
+    assert coincidence.evidence(start[None])[0] < 0
+    found, begun = coincidence.meet(start[None], 1)
+    assert begun[0] == 0
+    assert rigid.relative_rotation_error_deg(found[0], gt_transformation) < 0.3
+
+
 def flag(rng: np.random.Generator) -> np.ndarray:
     """A pole 2 long, hardly thicker than its points are apart, with a sheet on one side."""
     pole = np.column_stack([rng.uniform(-1.0, 1.0, 100), 0.01 * rng.normal(size=(100, 2))])
