@@ -230,6 +230,13 @@ def test_few_or_doubled_points_say_nothing() -> None:
         assert coincidence.evidence(np.eye(4)[None])[0] == -np.inf
 
 
+def test_points_that_are_there_often_do_no_harm() -> None:
+    points = random_sample(300, np.random.default_rng(4))
+    crowded = np.concatenate([points, np.repeat(points[:3], 12, axis=0)])
+    with np.errstate(all="raise"):
+        assert Coincidence(crowded, points).evidence(np.eye(4)[None])[0] > BEYOND_CHANCE
+
+
 def test_nothing_near_is_no_evidence() -> None:
     points = np.random.default_rng(0).normal(size=(100, 3))
     far = rigid.rigid(np.eye(3), np.full(3, 50.0))

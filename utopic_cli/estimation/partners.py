@@ -80,7 +80,8 @@ def _evenness(tree: cKDTree) -> float:
     near = near - near.mean(axis=1, keepdims=True)
     spread = np.linalg.eigvalsh(np.einsum("nkd,nke->nde", near, near))
     thickness = np.median(np.sqrt(np.maximum(spread[:, 0], 0.0) / np.maximum(spread[:, 1], 1e-300)))
-    return float(np.quantile(distance[:, 1] / distance[:, 8], 0.1) - PLAIN - THICK * thickness)
+    ratio = distance[:, 1] / np.maximum(distance[:, 8], 1e-300)  # points may be there often
+    return float(np.quantile(ratio, 0.1) - PLAIN - THICK * thickness)
 
 
 def _reach(tree: cKDTree) -> tuple[float, float]:
