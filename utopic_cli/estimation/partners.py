@@ -73,10 +73,13 @@ FIRST_STEPS = 10  # after which the evidence tells which fits are worth finishin
 FINISHED = 3
 
 
-def _evenness(tree: cKDTree) -> float:
-    """Tell how far points keep their distance from each other, 0 for random samples; see ``EVEN``."""
-    distance, index = tree.query(tree.data, k=range(1, 10))
-    near = tree.data[index]
+def _evenness(near: np.ndarray, distance: np.ndarray) -> float:
+    """Tell how far points keep their distance from each other, 0 for random samples; see ``EVEN``.
+
+    Args:
+        near: (N, 9, 3) each point and its eight nearest.
+        distance: (N, 9) to them.
+    """
     near = near - near.mean(axis=1, keepdims=True)
     spread = np.linalg.eigvalsh(np.einsum("nkd,nke->nde", near, near))
     thickness = np.median(np.sqrt(np.maximum(spread[:, 0], 0.0) / np.maximum(spread[:, 1], 1e-300)))
@@ -91,10 +94,11 @@ def _reach(tree: cKDTree) -> tuple[float, float]:
     their distance; there the bound is that a place has at most n * pi * r^2 points within r, for n points
     per unit of area, and n follows from the distance to the eighth neighbour.
     """
-    first, eighth = np.median(tree.query(tree.data, k=[2, 9])[0], axis=0)
+    distance, index = tree.query(tree.data, k=range(1, 10))
+    first, eighth = np.median(distance[:, [1, 8]], axis=0)
     if not np.isfinite(eighth) or first == 0:  # fewer than nine points, or most there twice
         return 0.0, np.inf
-    evenness = _evenness(tree)
+    evenness = _evenness(tree.data[index], distance)
     return float(0.5 * first if evenness < REGULAR else np.sqrt(BY_CHANCE / 8.0) * eighth), evenness
 
 
