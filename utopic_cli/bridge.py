@@ -55,13 +55,18 @@ class NetworkView:
 
 
 @lru_cache(maxsize=2)
-def load_network(weights: str, device: str) -> tuple[Utopic, dict[str, Any]]:
+def load_network(weights: str, device: str, verifier: bool = True) -> tuple[Utopic, dict[str, Any]]:
     """Load weights once a process: the network on its device, and its card.
+
+    Args:
+        weights: as of ``load_weights``.
+        device: as of ``choose_device``.
+        verifier: whether to load the verifier as well.
 
     Raises:
         InputError: the weights or the device can't be used.
     """
-    model, card = load_weights(weights)
+    model, card = load_weights(weights, verifier=verifier)
     read = {"point_features": POINT_FEATURES, "whole_features": WHOLE_FEATURES}
     if model.verifier is not None and not read.items() <= model.verifier.sizes.items():
         raise InputError(

@@ -16,12 +16,12 @@ from utopic_cli.model.pose_verifier import MEETING_REACH, meeting
 from utopic_cli.synthesis.packing import open_shapes
 
 
-def made_up(number: int, tell: float = 1.5) -> Lesson:
+def made_up(number: int, tell: float = 1.5, feature: int = 3) -> Lesson:
     """Four poses, one of them right: its points differ in one feature by ``tell`` on average."""
     rng = np.random.default_rng(number)
     points = rng.standard_normal((4, 2 * NODES - 40, POINT_FEATURES))
     right = np.arange(4) == number % 4
-    points[right, :, 3] += tell
+    points[right, :, feature] += tell
     whole = rng.standard_normal((4, WHOLE_FEATURES)).astype(np.float32)
     proposed = np.array([True, True, True, number % 5 > 0])
     gap = rng.uniform(0.0, 3.0, 100)
@@ -58,6 +58,25 @@ def test_the_same_seed_learns_the_same(lessons):
     for name, value in first.state_dict().items():
         assert np.array_equal(value, second.state_dict()[name]), name
     assert not np.array_equal(first.attention.weight.detach(), other.attention.weight.detach())
+
+
+def test_it_goes_on_from_what_another_learned(lessons):
+    def first(verifier, feature):
+        others = [made_up(number, feature=feature) for number in range(1000, 1040)]
+        return sum(lesson.right[plausible(verifier, lesson).argmax()] for lesson in others)
+
+    known = fit(lessons, seed=0)
+    kept = {name: value.clone() for name, value in known.state_dict().items()}
+    news = [made_up(number, feature=3 + 2 * (number % 2)) for number in range(100, 148)]
+    verifier, described = learn(news, {}, 1, start=known)
+    assert first(known, 3) >= 36 and first(known, 5) <= 22  # ten by chance
+    assert first(verifier, 3) >= 36 and first(verifier, 5) >= first(known, 5) + 8
+    for name, value in known.state_dict().items():  # the other itself is left alone
+        assert np.array_equal(value, kept[name]), name
+    before, after = (described[key]["scans"] for key in ("as_it_started", "out_of_fold"))
+    assert before["right_proposed"] == after["right_proposed"]
+    assert before["first_by_verifier"] < after["first_by_verifier"]
+    assert "as_it_started" not in learn(news, {}, 1)[1]
 
 
 def test_it_is_measured_on_shapes_left_out(lessons):

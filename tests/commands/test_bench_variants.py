@@ -70,7 +70,7 @@ def trained(monkeypatch, library, tmp_path):
             model.load_state_dict(start_from)
         out.mkdir(exist_ok=True)
         card = {"pairs_seen": total_pairs(config.schedule), "wall_clock_s": 90.0}
-        return export(model, {**card, "training": config.as_dict()}, out)
+        return export(model, {**card, "runs": [{"training": config.as_dict()}]}, out)
 
     monkeypatch.setattr("utopic_cli.training.trainer.train", train)
     monkeypatch.setattr("utopic_cli.synthesis.packing.open_shapes", lambda data, progress: library)
@@ -136,10 +136,10 @@ def test_the_three_tables_share_a_folder_and_what_they_have_in_common(bench, tra
     assert (
         schemes["predicted-u"] == "predicted" and schemes["no-u"] == "none" and schemes["full"] == "sampled"
     )
-    assert cards["no-masking"]["training"]["schedule"]["masking_from"] == 1.0
-    assert cards["no-u"]["training"]["loss"]["uncertainty"] == 0.0
+    assert cards["no-masking"]["runs"][0]["training"]["schedule"]["masking_from"] == 1.0
+    assert cards["no-u"]["runs"][0]["training"]["loss"]["uncertainty"] == 0.0
     assert cards["no-o-c-u-g"]["model"]["overlap"] is False
-    seeds = {name: card["training"]["schedule"]["seed"] for name, card in cards.items()}
+    seeds = {name: card["runs"][0]["training"]["schedule"]["seed"] for name, card in cards.items()}
     assert seeds.pop("full-again") == seeds["full"] + 1 and len(set(seeds.values())) == 1
     assert len(cards) == 11
 
@@ -272,7 +272,7 @@ def test_another_experiment_is_not_gone_on_with(bench, trained, short, tmp_path)
         assert result.exit_code == 4 and said in result.stderr, result.stderr
     card = tmp_path / "out" / "learned" / "utopic.json"
     content = json.loads(card.read_text())
-    content["training"]["loss"]["overlap"] = 9.0
+    content["runs"][0]["training"]["loss"]["overlap"] = 9.0
     card.write_text(json.dumps(content))
     result = bench("attention", "--resume")
     assert result.exit_code == 4 and "loss.overlap: 9.0, now 1.0" in result.stderr

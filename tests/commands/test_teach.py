@@ -32,15 +32,24 @@ def taught(monkeypatch):
     asked = []
     counts = {"right_proposed": 30, "first_by_surfaces": 20, "first_by_verifier": 28}
 
-    def teach(path, shapes, data, pairs, seed, workers, progress):
+    def teach(path, shapes, data, pairs, seed, workers, progress, start=None):
         asked.append((path, data, pairs, seed, workers))
         progress(0, pairs, "poses")
         about = {"pairs": pairs, "poses": 6 * pairs, "out_of_fold": {"a": counts, "b": counts}}
+        if start is not None:
+            asked[-1] = start
+            about["as_it_started"] = {"a": {**counts, "first_by_verifier": 25}, "b": counts}
         return PoseVerifier(POINT_FEATURES, WHOLE_FEATURES, 8), about
 
     monkeypatch.setattr("utopic_cli.benchmark.teaching.teach", teach)
     monkeypatch.setattr("utopic_cli.synthesis.packing.open_shapes", lambda data, progress=None: None)
     return asked
+
+
+def two_scans(folder):
+    scan = folder / "a.xyz"
+    scan.write_text("\n".join(f"{i % 7} {i % 11} {i % 13}" for i in range(300)))
+    return scan, shutil.copy(scan, folder / "b.xyz")
 
 
 def test_the_weights_get_a_verifier_and_lose_their_calibration(cli, weights, taught):
@@ -67,6 +76,49 @@ def test_a_verifier_is_not_replaced_unasked(cli, weights, taught):
     assert cli("teach", weights, "--overwrite").exit_code == 0
 
 
+def test_a_verifier_may_go_on_from_anothers(cli, weights, taught):
+    result = cli("teach", weights, "--pairs", 60, "--start-from", "utopic")
+    assert result.exit_code == 0, result.stderr
+    model, card = load_weights("utopic")
+    for name, value in taught[0].state_dict().items():
+        assert torch.equal(value, model.verifier.state_dict()[name]), name
+    assert "the verifier it went on from does in 53" in result.stderr
+    told = json.loads(weights.with_suffix(".json").read_text())["verifier"]
+    assert told["before"]["pairs"] == card["verifier"]["pairs"] and told["pairs"] == 60
+
+
+def test_there_has_to_be_a_verifier_to_go_on_from(cli, weights, taught):
+    result = cli("teach", weights, "--start-from", weights)
+    assert result.exit_code == 4 and "no verifier to go on from" in result.stderr and not taught
+
+
+def test_a_verifier_of_another_version_is_refused_but_may_be_replaced(cli, tmp_path, weights, taught):
+    class Older(PoseVerifier):
+        """One that could not read overlap."""
+
+        def __init__(self):
+            super().__init__(POINT_FEATURES, WHOLE_FEATURES, 8)
+            del self.overlap
+
+    model, card = load_weights(str(weights))
+    model.verifier = Older()
+    blob, text = pack_weights(model, {k: v for k, v in card.items() if k not in ("name", "sha256")})
+    weights.write_bytes(blob)
+    weights.with_suffix(".json").write_bytes(text)
+    result = cli("info", weights)
+    assert result.exit_code == 0
+    for refused in (
+        ("align", *two_scans(tmp_path), "-o", tmp_path / "T.txt", "--weights", weights),
+        ("teach", weights, "--start-from", weights, "--overwrite"),
+    ):
+        result = cli(*refused)
+        assert result.exit_code == 4, result.stderr
+        assert "verifier is of another version" in result.stderr and "--overwrite" in result.stderr
+        assert len(result.stderr.splitlines()[-1]) < 400
+    assert cli("teach", weights, "--overwrite").exit_code == 0
+    assert load_weights(str(weights))[0].verifier.sizes["width"] == 8
+
+
 def test_weights_that_are_not_there_are_an_input_error(cli, tmp_path, taught):
     result = cli("teach", tmp_path / "none.safetensors")
     assert result.exit_code == 4 and "no such weights file" in result.stderr and not taught
@@ -79,9 +131,6 @@ def test_a_verifier_for_other_features_is_refused_in_one_line(cli, tmp_path, wei
     other = tmp_path / "other.safetensors"
     other.write_bytes(blob)
     other.with_suffix(".json").write_bytes(text)
-    scan = tmp_path / "a.xyz"
-    scan.write_text("\n".join(f"{i % 7} {i % 11} {i % 13}" for i in range(300)))
-    twin = tmp_path / "b.xyz"
-    shutil.copy(scan, twin)
+    scan, twin = two_scans(tmp_path)
     result = cli("align", scan, twin, "-o", tmp_path / "T.txt", "--weights", other)
     assert result.exit_code == 4 and "teach another with utopic teach" in result.stderr

@@ -87,6 +87,18 @@ def test_the_export_is_the_average_of_the_weights(shapes, tmp_path):
     assert records[-1]["pairs"] == 8 and 0 <= records[-1]["hit_rate"] <= 1
 
 
+def test_the_card_tells_all_runs_that_weights_come_from(shapes, tmp_path):
+    first, first_card = load_weights(str(run(shapes, tmp_path / "first")))
+    assert [each["start"] for each in first_card["runs"]] == ["random weights"]
+    assert first_card["runs"][0]["training"] == CONFIG.as_dict()
+    start = {"start_from": first.state_dict(), "before": first_card["runs"]}
+    run(shapes, tmp_path / "second", minutes=0.0, **start)
+    card = load_weights(str(run(shapes, tmp_path / "second", resume=True)))[1]  # what came before is kept
+    assert card["pairs_seen"] == 16 and [each["pairs"] for each in card["runs"]] == [8, 8]
+    assert card["runs"][0] == first_card["runs"][0] and card["runs"][1]["start"] == "the run before"
+    assert card["wall_clock_s"] == pytest.approx(sum(each["wall_clock_s"] for each in card["runs"]), abs=0.11)
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_saves_the_step_in_hand(shapes, tmp_path, number):
     def interrupt(record):

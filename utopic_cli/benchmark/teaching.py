@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -27,6 +28,7 @@ WIDTH = 64
 EPOCHS = 10
 BATCH = 12  # pairs
 RATE = 3e-3
+MORE_RATE, MORE_EPOCHS = 5e-4, 4  # of one that goes on from another
 WEIGHT_DECAY = 0.02
 BY_ITSELF = 0.5
 """Weight of each pose's own right or wrong, beside which pose of a pair is the right one."""
@@ -44,6 +46,7 @@ def teach(
     seed: int,
     workers: int = 1,
     progress: Callable[[int, int, str], None] | None = None,
+    start: PoseVerifier | None = None,
 ) -> tuple[PoseVerifier, dict[str, Any]]:
     """Teach a verifier for some weights.
 
@@ -55,6 +58,7 @@ def teach(
         seed: of the pairs and of the verifier's first weights.
         workers: processes that solve pairs; the result does not depend on their number.
         progress: called with (done, in all, what goes on).
+        start: a verifier that has learned to choose among poses of other matches, to go on from.
 
     Returns:
         The verifier, and what to write about it into the card.
@@ -73,7 +77,7 @@ def teach(
     found = each(partial(_task, weights, train, data, seed), pairs, workers, tell)
     lessons = [lesson for lesson in found if lesson is not None]
     about = {"data": data, "shapes": len(train), "seed": seed}
-    return learn(lessons, about, seed, progress)
+    return learn(lessons, about, seed, progress, start)
 
 
 def learn(
@@ -81,8 +85,11 @@ def learn(
     about: dict[str, Any],
     seed: int,
     progress: Callable[[int, int, str], None] | None = None,
+    start: PoseVerifier | None = None,
 ) -> tuple[PoseVerifier, dict[str, Any]]:
     """Fit a verifier to lessons, after measuring it on shapes left out in turn.
+
+    One that goes on from another is measured on pairs left out; their shapes the other may have seen.
 
     Raises:
         InputError: too few lessons, or all of one kind.
@@ -98,7 +105,7 @@ def learn(
         if progress is not None:
             progress(number, FOLDS + 1, "learning")
         rest = [lesson for lesson, its in zip(lessons, fold, strict=True) if its != number]
-        verifier = fit(rest, seed)
+        verifier = fit(rest, seed, start)
         held += [
             (lesson, plausible(verifier, lesson))
             for lesson, its in zip(lessons, fold, strict=True)
@@ -111,34 +118,43 @@ def learn(
         "pairs": len(lessons),
         "poses": int(sum(len(lesson.right) for lesson in lessons)),
         "right": int(sum(lesson.right.sum() for lesson in lessons)),
-        "epochs": EPOCHS,
+        "epochs": EPOCHS if start is None else MORE_EPOCHS,
         "out_of_fold": _chosen(held),
     }
-    verifier = fit(lessons, seed)
+    if start is not None:
+        description["as_it_started"] = _chosen([(lesson, plausible(start, lesson)) for lesson in lessons])
+    verifier = fit(lessons, seed, start)
     verifier.overlap.copy_(torch.from_numpy(reading_of(lessons)))
     return verifier, {**description, "overlap": _told(verifier, lessons)}
 
 
-def fit(lessons: Sequence[Lesson], seed: int) -> PoseVerifier:
+def fit(lessons: Sequence[Lesson], seed: int, start: PoseVerifier | None = None) -> PoseVerifier:
     """Train a verifier: of a pair's poses the right one, and of each pose whether it is right.
 
     Args:
         lessons: some with right and wrong poses.
         seed: of the first weights, the order, and which points are looked at.
+        start: to go on from, more slowly and not as long, so that it keeps what it knows; None: from nothing.
     """
+    rate, epochs = (RATE, EPOCHS) if start is None else (MORE_RATE, MORE_EPOCHS)
     rng = np.random.default_rng(seed)
     points = [_evenly(lesson.points) for lesson in lessons]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        verifier = PoseVerifier(POINT_FEATURES, WHOLE_FEATURES, WIDTH)
-        verifier.normalise(
-            torch.from_numpy(np.concatenate([each[:, ::16].reshape(-1, POINT_FEATURES) for each in points])),
-            torch.from_numpy(np.concatenate([lesson.whole for lesson in lessons])),
-        )
-        optimiser = torch.optim.AdamW(verifier.parameters(), RATE, weight_decay=WEIGHT_DECAY)
-        steps = EPOCHS * -(-len(lessons) // BATCH)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
-        for _ in range(EPOCHS):
+        if start is None:
+            verifier = PoseVerifier(POINT_FEATURES, WHOLE_FEATURES, WIDTH)
+            verifier.normalise(
+                torch.from_numpy(
+                    np.concatenate([one[:, ::16].reshape(-1, POINT_FEATURES) for one in points])
+                ),
+                torch.from_numpy(np.concatenate([lesson.whole for lesson in lessons])),
+            )
+        else:
+            verifier = deepcopy(start).train()
+        optimiser = torch.optim.AdamW(verifier.parameters(), rate, weight_decay=WEIGHT_DECAY)
+        steps = epochs * -(-len(lessons) // BATCH)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+        for _ in range(epochs):
             for chosen in _batches(rng.permutation(len(lessons))):
                 some = rng.permutation(2 * NODES)[:NODES]
                 odds = verifier(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -82,7 +82,7 @@ def train(
 
         settings = read_training_config(config)
         place = choose_device(device)
-        first = _network_of(start_from) if start_from else None
+        first, before = _network_of(start_from) if start_from else (None, [])
     shapes = load_library(data, console, resume)
     counts = {split: len(shapes.select(split)) for split in ("train", "val")}
     console.line(f"training on {place} with {counts['train']} shapes, {counts['val']} more to validate")
@@ -99,6 +99,7 @@ def train(
                 workers=workers,
                 synthesis=synthesis,
                 start_from=first,
+                before=before,
                 progress=view.show,
             )
     except InterruptedRun as stop:
@@ -108,12 +109,15 @@ def train(
         console.line(line)
 
 
-def _network_of(weights: str) -> dict[str, Tensor]:
-    """Return the tensors of some weights, less the verifier: it learned from another network's matches."""
+def _network_of(weights: str) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
+    """Return the tensors of some weights, and the runs that they come from.
+
+    Less the verifier: it learned from another network's matches.
+    """
     from utopic_cli.model.weights import load_weights
 
-    tensors = load_weights(weights)[0].state_dict()
-    return {name: tensor for name, tensor in tensors.items() if not name.startswith("verifier.")}
+    model, card = load_weights(weights, verifier=False)
+    return model.state_dict(), list(card.get("runs", []))
 
 
 def check_run(out: Path, resume: bool) -> None:

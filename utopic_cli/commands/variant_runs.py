@@ -177,7 +177,8 @@ class Experiment:
             InputError: it was made with other settings, or its card can't be read.
         """
         card = read_card(weights)
-        changed = describe_difference(card.get("training", {}), config.as_dict())
+        runs = card.get("runs") or [{}]
+        changed = describe_difference(runs[-1].get("training", {}), config.as_dict())
         if changed:
             raise InputError(f"{weights}: made with other settings ({changed}); name another folder")
         return int(card.get("pairs_seen", 0))

@@ -11,6 +11,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
+from torch import Tensor
 
 from utopic_cli.config import ModelConfig, from_dict, to_dict
 from utopic_cli.errors import InputError
@@ -57,11 +58,16 @@ def read_card(path: Path) -> dict[str, Any]:
     return card
 
 
-def load_weights(name_or_path: str) -> tuple[Utopic, dict[str, Any]]:
+VERIFIER = "verifier."
+"""What the names of the verifier's tensors begin with."""
+
+
+def load_weights(name_or_path: str, *, verifier: bool = True) -> tuple[Utopic, dict[str, Any]]:
     """Build a trained network for inference on the CPU, in float32.
 
     Args:
         name_or_path: a bundled name, or a ``.safetensors`` file with its card beside it.
+        verifier: whether to load the verifier as well, if there is one; it may be of another version.
 
     Returns:
         The network in evaluation mode, and its card with ``name`` and ``sha256`` filled in.
@@ -77,9 +83,15 @@ def load_weights(name_or_path: str) -> tuple[Utopic, dict[str, Any]]:
     if card.get("sha256", digest) != digest:
         raise InputError(f"{path}: the file differs from the one its card describes (sha256 {digest[:12]})")
     model = Utopic(from_dict(ModelConfig, card["model"], str(path.with_suffix(".json"))))
-    model.verifier = _verifier(card, path)
+    model.verifier = _verifier(card, path) if verifier else None
     try:
         tensors = {name: tensor.float() for name, tensor in load_tensors(blob).items()}
+        if not verifier:
+            tensors = {name: tensor for name, tensor in tensors.items() if not name.startswith(VERIFIER)}
+        elif model.verifier is not None and _other_version(model.verifier, tensors):
+            raise InputError(
+                f"{path}: its verifier is of another version; teach another: utopic teach {path} --overwrite"
+            )
         model.load_state_dict(tensors, strict=True)
     except (SafetensorError, RuntimeError) as error:
         reason = " ".join(str(error).strip().splitlines()[:2])
@@ -103,6 +115,13 @@ def _verifier(card: dict[str, Any], path: Path) -> PoseVerifier | None:
     ):
         raise InputError(f"{path.with_suffix('.json')}: the verifier's sizes can't be read")
     return PoseVerifier(*(sizes[name] for name in names))
+
+
+def _other_version(verifier: PoseVerifier, tensors: dict[str, Tensor]) -> bool:
+    """Tell whether a file holds a verifier, but not one that this version builds."""
+    held = {name: tensor.shape for name, tensor in tensors.items() if name.startswith(VERIFIER)}
+    built = {VERIFIER + name: tensor.shape for name, tensor in verifier.state_dict().items()}
+    return bool(held) and held != built
 
 
 def pack_weights(model: Utopic, card: dict[str, Any]) -> tuple[bytes, bytes]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from utopic_cli.training.checkpoint import describe_difference, read_checkpoint,
 from utopic_cli.training.config import Schedule, TrainingConfig, training_config_from
 from utopic_cli.training.network import TrainingNetwork
 from utopic_cli.training.optimisation import RunningAverage, make_optimiser
+
+RANDOM, THE_RUN_BEFORE = "random weights", "the run before"
 
 
 @dataclass
@@ -31,6 +34,8 @@ class Run:
         average: running average of the weights, which is what gets exported.
         done: pairs seen.
         elapsed: seconds trained, over all sessions.
+        start: what it began with.
+        before: the runs that the weights it began with come from, as of ``record``, oldest first.
     """
 
     config: TrainingConfig
@@ -41,6 +46,8 @@ class Run:
     average: RunningAverage
     done: int = 0
     elapsed: float = 0.0
+    start: str = RANDOM
+    before: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def checkpoint(self) -> Path:
@@ -58,8 +65,25 @@ class Run:
                 "average": self.average.weights,
                 "pairs": self.done,
                 "elapsed_s": self.elapsed,
+                "start": self.start,
+                "before": self.before,
             },
         )
+
+    def record(self) -> dict[str, Any]:
+        """Return what a card says of the weights' way here: this run and those before it, and their sums."""
+        own = {
+            "pairs": self.done,
+            "wall_clock_s": round(self.elapsed, 1),
+            "start": self.start,
+            "training": self.config.as_dict(),
+        }
+        runs = [*self.before, own]
+        return {
+            "pairs_seen": sum(each["pairs"] for each in runs),
+            "wall_clock_s": round(sum(each["wall_clock_s"] for each in runs), 1),
+            "runs": runs,
+        }
 
 
 def start_run(
@@ -68,6 +92,7 @@ def start_run(
     out: Path,
     resume: bool,
     start_from: dict[str, torch.Tensor] | None,
+    before: Sequence[dict[str, Any]] = (),
 ) -> Run:
     """Build everything a run consists of, new or as a checkpoint left it.
 
@@ -77,6 +102,7 @@ def start_run(
         out: its folder.
         resume: take up the checkpoint in it.
         start_from: weights of the inference network to start from.
+        before: the runs that these come from, as of ``Run.record``.
 
     Raises:
         InputError: nothing to resume, other settings than the checkpoint's, or another architecture.
@@ -98,6 +124,8 @@ def start_run(
         network,
         make_optimiser(network, schedule),
         RunningAverage(network.inference, schedule.average),
+        start=RANDOM if start_from is None else THE_RUN_BEFORE if before else "given weights",
+        before=list(before),
     )
     if resume:
         state = read_checkpoint(run.checkpoint)
@@ -114,6 +142,7 @@ def start_run(
         run.optimiser.load_state_dict(state["optimiser"])
         run.average.restore(state["average"])
         run.done, run.elapsed = state["pairs"], state["elapsed_s"]
+        run.start, run.before = state["start"], state["before"]
     return run
 
 

@@ -6,7 +6,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ def train(
     workers: int = 1,
     synthesis: str = "auto",
     start_from: dict[str, torch.Tensor] | None = None,
+    before: Sequence[dict[str, Any]] = (),
     progress: Progress | None = None,
 ) -> Path:
     """Train, checkpoint, and export the averaged weights.
@@ -67,6 +68,7 @@ def train(
         synthesis: where pairs are made: by the ``workers``, each shown ``repeats`` times; in batches on
             the training ``device``, all new; ``auto``: on a GPU if that is what trains.
         start_from: weights of the inference network to start from.
+        before: the runs that these come from, as their card has them.
         progress: called with every record of the journal.
 
     Returns:
@@ -87,7 +89,7 @@ def train(
                 "choose a multiple in the configuration"
             )
         out.mkdir(parents=True, exist_ok=True)
-        run = start_run(config, device, out, resume, start_from)
+        run = start_run(config, device, out, resume, start_from, before)
         limits = Limits(minutes, lambda: bool(received))
         on_device = synthesis == "device" or (synthesis == "auto" and device.type == "cuda")
         batches = _batches(run, training_shapes, processes, None if on_device else workers)
@@ -95,9 +97,7 @@ def train(
         path = out / "utopic.safetensors"
         if processes.leads:
             card = {
-                "pairs_seen": run.done,
-                "wall_clock_s": round(run.elapsed, 1),
-                "training": config.as_dict(),
+                **run.record(),
                 "data": {
                     "shapes": len(training_shapes),
                     "sets": sorted(set(training_shapes.sets.tolist())),
