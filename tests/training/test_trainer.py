@@ -39,6 +39,7 @@ from utopic_cli.training.data import (
 from utopic_cli.training.network import TrainingNetwork, total_loss
 from utopic_cli.training.optimisation import learning_rate
 from utopic_cli.training.pace import InterruptedRun
+from utopic_cli.training.validation import validation_pairs
 
 SCHEDULE = Schedule(
     descriptor_pairs=4,
@@ -135,6 +136,13 @@ def test_the_journal_starts_with_the_untrained_network(shapes, tmp_path):
     assert [record["pairs"] for record in records] == [0, SCHEDULE.batch]
     assert "hit_rate" in records[0] and "match_rate" not in records[0]  # only what the stage trains
     assert records[1]["left_s"] == 0 and 0 <= records[1]["waiting"] <= 1
+
+
+def test_a_short_run_is_validated_on_fewer_pairs(shapes):
+    config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, validation_pairs=6))
+    every, first, few = (validation_pairs(shapes, config, minutes) for minutes in (None, 0.9, 0.0))
+    assert [len(pairs) for pairs in (every, first, few)] == [6, 5, 4]
+    assert torch.equal(every[4].source.points, first[4].source.points)
 
 
 def test_weights_of_another_architecture_are_refused(shapes, tmp_path):

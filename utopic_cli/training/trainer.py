@@ -150,7 +150,7 @@ def _loop(
     weights = run.config.loss.weights()
     # On CPUs without matrix units bfloat16 costs half as much again, so only GPUs get it.
     reduced = schedule.bfloat16 and device.type == "cuda"
-    held_out = validation_pairs(validation_shapes, run.config) if processes.leads else []
+    held_out = validation_pairs(validation_shapes, run.config, limits.minutes) if processes.leads else []
     measured: dict[str, float] = {}
     meter = Meter()
     begun, elapsed_before = time.monotonic(), run.elapsed

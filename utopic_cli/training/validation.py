@@ -21,6 +21,8 @@ from utopic_cli.training.run import Run
 
 VALIDATION_SEED = 900_001
 VALIDATION_POINTS = 768
+SECONDS_A_PAIR = 10.0
+FEWEST_PAIRS = 4
 
 
 @torch.no_grad()
@@ -139,10 +141,22 @@ class PeriodicValidation:
         return {name: round(value, 4) for name, value in measured.items()}
 
 
-def validation_pairs(shapes: ShapeLibrary, config: TrainingConfig) -> list[TrainingPair]:
-    """Make the held-out pairs of a run: always the same for the same shapes and settings."""
+def validation_pairs(
+    shapes: ShapeLibrary, config: TrainingConfig, minutes: float | None = None
+) -> list[TrainingPair]:
+    """Make the held-out pairs of a run: always the same for the same shapes and settings.
+
+    Args:
+        shapes: to make them of.
+        config: settings of the run.
+        minutes: how long the run may take. Of a short one they would eat the time: it gets the first of them,
+            one for each ``SECONDS_A_PAIR``, at least ``FEWEST_PAIRS``.
+    """
+    count = config.schedule.validation_pairs
+    if minutes is not None:
+        count = min(count, max(FEWEST_PAIRS, int(60.0 * minutes / SECONDS_A_PAIR)))
     made = []
-    for number in range(config.schedule.validation_pairs):
+    for number in range(count):
         rng = np.random.default_rng([VALIDATION_SEED, number])
         pair = random_pair(shapes, rng, config.pairs)
         made.append(to_training_pair(sample_pair(pair, VALIDATION_POINTS, rng), config.model.neighbours))
