@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from utopic_cli.benchmark.lessons import TRIALS, Lesson, Question, lesson_of, question_of
 from utopic_cli.benchmark.teaching import FEWEST, fit, learn, plausible, reading_of
@@ -75,8 +76,19 @@ def test_it_goes_on_from_what_another_learned(lessons):
         assert np.array_equal(value, kept[name]), name
     before, after = (described[key]["scans"] for key in ("as_it_started", "out_of_fold"))
     assert before["right_proposed"] == after["right_proposed"]
-    assert before["first_by_verifier"] < after["first_by_verifier"]
+    assert before["first_by_verifier"] < after["first_by_verifier"] and not described["kept_as_it_started"]
     assert "as_it_started" not in learn(news, {}, 1)[1]
+
+
+def test_it_stays_as_it_was_where_it_learns_nothing_better(lessons):
+    known = fit(lessons, seed=0)
+    plain = [made_up(number, tell=5.0) for number in range(200, 240)]
+    verifier, described = learn(plain, {}, 1, start=known)
+    counts = described["as_it_started"]["scans"]
+    assert counts["first_by_verifier"] == counts["right_proposed"] and described["kept_as_it_started"]
+    for name, value in known.state_dict().items():
+        assert name == "overlap" or torch.equal(value, verifier.state_dict()[name]), name
+    assert not torch.equal(verifier.overlap, known.overlap)  # which is read anew all the same
 
 
 def test_it_is_measured_on_shapes_left_out(lessons):

@@ -39,6 +39,7 @@ def taught(monkeypatch):
         if start is not None:
             asked[-1] = start
             about["as_it_started"] = {"a": {**counts, "first_by_verifier": 25}, "b": counts}
+            about["kept_as_it_started"] = pairs == 40
         return PoseVerifier(POINT_FEATURES, WHOLE_FEATURES, 8), about
 
     monkeypatch.setattr("utopic_cli.benchmark.teaching.teach", teach)
@@ -82,9 +83,11 @@ def test_a_verifier_may_go_on_from_anothers(cli, weights, taught):
     model, card = load_weights("utopic")
     for name, value in taught[0].state_dict().items():
         assert torch.equal(value, model.verifier.state_dict()[name]), name
-    assert "the verifier it went on from does in 53" in result.stderr
+    assert "the verifier it went on from does in 53\n" in result.stderr
     told = json.loads(weights.with_suffix(".json").read_text())["verifier"]
     assert told["before"]["pairs"] == card["verifier"]["pairs"] and told["pairs"] == 60
+    result = cli("teach", weights, "--pairs", 40, "--start-from", "utopic", "--overwrite")
+    assert "the verifier it went on from does in 53, and is kept as it was\n" in result.stderr
 
 
 def test_there_has_to_be_a_verifier_to_go_on_from(cli, weights, taught):

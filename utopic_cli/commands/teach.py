@@ -83,7 +83,8 @@ def teach(
     )
     if first is not None:
         known = sum(count["first_by_verifier"] for count in described["as_it_started"].values())
-        console.line(f"  the verifier it went on from does in {known}")
+        kept = ", and is kept as it was" if described["kept_as_it_started"] else ""
+        console.line(f"  the verifier it went on from does in {known}{kept}")
     console.line(f"so that its answers can be trusted: utopic calibrate {path} --data {data}")
 
 
