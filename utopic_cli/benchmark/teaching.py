@@ -90,7 +90,7 @@ def learn(
     """Fit a verifier to lessons, after measuring it on shapes left out in turn.
 
     One that goes on from another is measured on pairs left out; their shapes the other may have seen.
-    Unless it has a right pose first more often there, the other stays as it was, and only overlap is read anew.
+    Unless it has a right pose first more often, the other stays as it was, and only overlap is read anew.
 
     Raises:
         InputError: too few lessons, or all of one kind.
