@@ -92,7 +92,7 @@ class UncertaintyQuantification(nn.Module):
         noise = torch.randn(shape, generator=generator).to(mean.device)
         deviation = (0.5 * log_variance).exp()
         if self.scheme == "matched":
-            raw = self._spread(deviation)
+            raw = self.spread(deviation)
             # What the samples teach is the mean's alone.
             log_variance, deviation = log_variance.detach(), deviation.detach()
         samples = torch.sigmoid(mean[:, None] + noise * deviation[:, None])
@@ -104,7 +104,7 @@ class UncertaintyQuantification(nn.Module):
             raw = torch.zeros_like(mean)
         return OverlapDistribution(mean, log_variance, samples, raw)
 
-    def _spread(self, deviation: Tensor) -> Tensor:
+    def spread(self, deviation: Tensor) -> Tensor:
         """Variance of K squeezed samples about a mean of 0, taken at even quantiles -> (B, N)."""
         steps = torch.arange(self.samples, dtype=torch.float32, device=deviation.device)
         noise = torch.special.ndtri((steps + 0.5) / self.samples)

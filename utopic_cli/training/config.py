@@ -39,6 +39,7 @@ class Schedule:
         matching_rate: factor on the rate of gains and biases (``optimisation.FAST``).
         weight_decay: decoupled weight decay.
         clip: largest gradient norm.
+        variance_pairs: pairs to which the head of the variance is fitted at the end; 0 leaves it.
         masking_from: share of the joint stage after which random masking starts.
         average: decay of the running average of the weights, which is what is exported.
         bfloat16: on a GPU, run the network in bfloat16 (losses and Sinkhorn stay float32).
@@ -50,6 +51,7 @@ class Schedule:
 
     descriptor_pairs: int = 8000
     joint_pairs: int = 12000
+    variance_pairs: int = 0
     repeats: int = 2
     batch: int = 2
     points: tuple[int, ...] = (400, 900)

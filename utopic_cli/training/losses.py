@@ -102,12 +102,27 @@ def reliability_loss(
         valid: (B, N) float, 0 for points that only fill a batch up.
         shown: (B,) 1 where the network was shown the right transformation or nearly, else 0.
     """
+    wrong, weight = reliability_targets(scores, near, overlap, valid, shown)
+    odds = reliability_odds(distribution.raw_uncertainty)
+    return _mean(binary_cross_entropy_with_logits(odds, wrong, reduction="none"), weight)
+
+
+def reliability_odds(raw_uncertainty: Tensor) -> Tensor:
+    """Read raw uncertainty as log-odds that a point's best match is wrong."""
+    return (raw_uncertainty.clamp_min(1e-6) / EVEN_VARIANCE).log()
+
+
+def reliability_targets(
+    scores: Tensor, near: Tensor, overlap: Tensor, valid: Tensor, shown: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Tell which points of one cloud are matched wrongly, (B, N) in {0, 1}, and what each counts (B, N).
+
+    Arguments as of ``reliability_loss``.
+    """
     best = scores.detach().argmax(dim=2, keepdim=True)
     reached = near.any(dim=2).float()
     wrong = reached * (1.0 - near.gather(2, best)[:, :, 0].float() * overlap)
-    odds = (distribution.raw_uncertainty.clamp_min(1e-6) / EVEN_VARIANCE).log()
-    terms = binary_cross_entropy_with_logits(odds, wrong, reduction="none")
-    return _mean(terms, torch.maximum(reached, FAR_WEIGHT * shown[:, None]) * valid)
+    return wrong, torch.maximum(reached, FAR_WEIGHT * shown[:, None]) * valid
 
 
 def chamfer_loss(predicted: Tensor, expected: Tensor, valid: Tensor) -> Tensor:

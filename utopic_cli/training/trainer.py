@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from utopic_cli.errors import InputError, UtopicError
+from utopic_cli.model.utopic import Utopic
 from utopic_cli.synthesis.shapes import ShapeLibrary
 from utopic_cli.training.batched import BatchedPairs, batches_on_device
 from utopic_cli.training.config import Schedule, TrainingConfig
@@ -24,7 +25,8 @@ from utopic_cli.training.optimisation import learning_rate, step
 from utopic_cli.training.pace import InterruptedRun, Limits, Meter, caught_signals
 from utopic_cli.training.processes import Processes, joined_processes
 from utopic_cli.training.run import Run, export, start_run, total_pairs
-from utopic_cli.training.validation import PeriodicValidation, validation_pairs
+from utopic_cli.training.validation import PeriodicValidation, fixed_pairs, validation_pairs
+from utopic_cli.training.variance import fit_variance
 
 log = logging.getLogger(__name__)
 
@@ -104,10 +106,27 @@ def train(
                 },
                 "validation": measured,
             }
-            export(run.average.network(run.network.inference), card, out)
+            model = run.average.network(run.network.inference)
+            if config.schedule.variance_pairs and run.done >= total_pairs(config.schedule):
+                card["uncertainty"] = _fit_variance(model, config, training_shapes)
+            export(model, card, out)
         if signal.SIGINT in received:
             raise InterruptedRun(path)  # saved, but not what was asked for in the first place
         return path
+
+
+def _fit_variance(model: Utopic, config: TrainingConfig, shapes: ShapeLibrary) -> dict[str, Any]:
+    """Fit the head of the variance by itself, and say so for the card."""
+    count = config.schedule.variance_pairs
+    pairs = fixed_pairs(shapes, config, config.schedule.seed, count)
+    before, after = fit_variance(model, (_to(pair, next(model.parameters()).device) for pair in pairs))
+    return {
+        "what": "the head of the variance, fitted by itself after the last run",
+        "pairs": count,
+        "seed": config.schedule.seed,
+        "shown": "the right transformation, and none",
+        "loss": [round(before, 4), round(after, 4)],
+    }
 
 
 def _batches(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -155,9 +155,14 @@ def validation_pairs(
     count = config.schedule.validation_pairs
     if minutes is not None:
         count = min(count, max(FEWEST_PAIRS, int(60.0 * minutes / SECONDS_A_PAIR)))
-    made = []
+    return list(fixed_pairs(shapes, config, VALIDATION_SEED, count))
+
+
+def fixed_pairs(
+    shapes: ShapeLibrary, config: TrainingConfig, seed: int, count: int
+) -> Iterator[TrainingPair]:
+    """Make ``count`` pairs of a run's kinds, batches of one, the same for the same arguments."""
     for number in range(count):
-        rng = np.random.default_rng([VALIDATION_SEED, number])
+        rng = np.random.default_rng([seed, number])
         pair = random_pair(shapes, rng, config.pairs)
-        made.append(to_training_pair(sample_pair(pair, VALIDATION_POINTS, rng), config.model.neighbours))
-    return made
+        yield to_training_pair(sample_pair(pair, VALIDATION_POINTS, rng), config.model.neighbours)
