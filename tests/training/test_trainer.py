@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from tests.model.conftest import SMALL
+from tests.training.conftest import SCHEDULE
 from utopic_cli.config import ModelConfig
 from utopic_cli.errors import InputError
 from utopic_cli.model.weights import load_weights
 from utopic_cli.synthesis.pairs import PairSettings, random_pair, surface_pair
-from utopic_cli.synthesis.shapes import procedural_shapes
 from utopic_cli.training import network as losses_of
 from utopic_cli.training import trainer
-from utopic_cli.training.checkpoint import read_checkpoint
+from utopic_cli.training.checkpoint import read_checkpoint, write_checkpoint
 from utopic_cli.training.config import (
     Schedule,
     TrainingConfig,
@@ -39,23 +39,10 @@ from utopic_cli.training.data import (
 from utopic_cli.training.network import TrainingNetwork, total_loss
 from utopic_cli.training.optimisation import learning_rate
 from utopic_cli.training.pace import InterruptedRun
+from utopic_cli.training.run import total_pairs
 from utopic_cli.training.validation import validation_pairs
 
-SCHEDULE = Schedule(
-    descriptor_pairs=4,
-    joint_pairs=4,
-    points=(60, 80),
-    last_points=(60, 80),
-    bfloat16=False,
-    validation_pairs=1,
-    masking_from=0.5,
-)
 CONFIG = TrainingConfig(model=ModelConfig(**SMALL), schedule=SCHEDULE)
-
-
-@pytest.fixture(scope="module")
-def shapes():
-    return procedural_shapes(np.random.default_rng(0), 10)
 
 
 def run(shapes, out, config=CONFIG, **options):
@@ -230,6 +217,15 @@ def test_resuming_needs_a_sound_checkpoint_of_the_same_settings(shapes, tmp_path
         run(shapes, tmp_path, resume=True)
 
 
+def test_a_checkpoint_that_does_not_say_where_it_began_is_resumed(shapes, tmp_path):
+    run(shapes, tmp_path, minutes=0.0)
+    state = read_checkpoint(tmp_path / "checkpoint.pt")
+    del state["start"], state["before"]
+    write_checkpoint(tmp_path / "checkpoint.pt", state)
+    run(shapes, tmp_path, resume=True)
+    assert read_checkpoint(tmp_path / "checkpoint.pt")["pairs"] == total_pairs(SCHEDULE)
+
+
 def test_batches_depend_on_seed_and_number_alone(shapes):
     def points(seed, number):
         pairs = SynthesisedPairs(shapes, PairSettings(), seed, 6)
@@ -290,6 +286,15 @@ def test_shipped_configurations_are_read(name):
         ("model = [", "not valid TOML"),
         ("[schedule]\noptimiser = 'adam'", "optimiser is 'adam'; choose adamw, sgd"),
         ("[schedule]\nbatch = 3", "descriptor_pairs is 8000; give a multiple of batch 3"),
+        ("[schedule]\nvariance_pairs = -1", "variance_pairs is -1; it must be at least 0"),
+        (
+            "[model]\nhypothesis = false\n[schedule]\nvariance_pairs = 240",
+            r"mine\.toml: variance_pairs needs .* hypothesis true; set it to 0",
+        ),
+        (
+            '[model]\nuncertainty_scheme = "sampled"\n[schedule]\nvariance_pairs = 240',
+            'variance_pairs needs uncertainty_scheme "matched"',
+        ),
         ("[schedule]\npoints = [900, 400]", r"points is \[900, 400\]; give the fewest"),
     ],
 )

@@ -5,44 +5,30 @@ from __future__ import annotations
 import dataclasses
 from copy import deepcopy
 
-import numpy as np
 import pytest
 import torch
 
 from tests.model.conftest import SMALL
+from tests.training.conftest import SCHEDULE
 from utopic_cli.config import ModelConfig
 from utopic_cli.model.utopic import Utopic
 from utopic_cli.model.weights import load_weights
-from utopic_cli.synthesis.shapes import procedural_shapes
 from utopic_cli.training import trainer
 from utopic_cli.training.checkpoint import read_checkpoint
-from utopic_cli.training.config import Schedule, TrainingConfig
+from utopic_cli.training.config import TrainingConfig
 from utopic_cli.training.network import TrainingNetwork
 from utopic_cli.training.validation import fixed_pairs
 from utopic_cli.training.variance import fit_variance
 
 CONFIG = TrainingConfig(
     model=ModelConfig(**SMALL, uncertainty_scheme="matched", hypothesis=True),
-    schedule=Schedule(
-        descriptor_pairs=2,
-        joint_pairs=2,
-        points=(60, 80),
-        last_points=(60, 80),
-        bfloat16=False,
-        validation_pairs=1,
-        variance_pairs=3,
-    ),
+    schedule=dataclasses.replace(SCHEDULE, descriptor_pairs=2, joint_pairs=2, variance_pairs=3),
 )
 HEAD = (
     "quantification.log_variance.weight",
     "quantification.log_variance.bias",
     "quantification.evidence.weight",
 )
-
-
-@pytest.fixture(scope="module")
-def shapes():
-    return procedural_shapes(np.random.default_rng(0), 10)
 
 
 @pytest.fixture(scope="module")

@@ -75,8 +75,8 @@ class Schedule:
         """Refuse a schedule that can't be run.
 
         Raises:
-            InputError: an unknown optimiser, a size below 1, a range of points that is none, or
-                pairs that don't fill whole steps.
+            InputError: an unknown optimiser, a size below 1, a range of points that is none, pairs
+                that don't fill whole steps, or fewer than none for the variance.
         """
         if self.optimiser not in OPTIMISERS:
             raise InputError(f"optimiser is {self.optimiser!r}; choose {', '.join(OPTIMISERS)}")
@@ -90,6 +90,8 @@ class Schedule:
         for name in ("descriptor_pairs", "joint_pairs"):
             if getattr(self, name) < 0 or getattr(self, name) % self.batch:
                 raise InputError(f"{name} is {getattr(self, name)}; give a multiple of batch {self.batch}")
+        if self.variance_pairs < 0:
+            raise InputError(f"variance_pairs is {self.variance_pairs}; it must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,18 @@ class TrainingConfig:
     schedule: Schedule = field(default_factory=Schedule)
     pairs: PairSettings = field(default_factory=PairSettings)
 
+    def __post_init__(self) -> None:
+        """Refuse to fit a head that the network has not, before training rather than after.
+
+        Raises:
+            InputError: ``variance_pairs`` with another scheme than ``matched``, or without hypotheses.
+        """
+        model = self.model
+        if self.schedule.variance_pairs and not (model.uncertainty_scheme == "matched" and model.hypothesis):
+            raise InputError(
+                'variance_pairs needs uncertainty_scheme "matched" and hypothesis true; set it to 0'
+            )
+
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as plain data."""
         return {section: to_dict(getattr(self, section)) for section in SECTIONS}
@@ -144,7 +158,8 @@ def training_config_from(values: dict[str, Any], where: str) -> TrainingConfig:
     """Build a configuration from sections of plain data.
 
     Raises:
-        InputError: an unknown section or key (the known ones are listed), or a wrong type.
+        InputError: an unknown section or key (the known ones are listed), a wrong type, or values
+            that don't go together.
     """
     unknown = sorted(set(values) - set(SECTIONS))
     if unknown:
@@ -152,7 +167,10 @@ def training_config_from(values: dict[str, Any], where: str) -> TrainingConfig:
     built: dict[str, Any] = {
         name: from_dict(kind, values.get(name, {}), f"{where} [{name}]") for name, kind in SECTIONS.items()
     }
-    return TrainingConfig(**built)
+    try:
+        return TrainingConfig(**built)
+    except InputError as error:  # sections that don't go together
+        raise InputError(f"{where}: {error}") from error
 
 
 def read_training_config(name_or_path: str) -> TrainingConfig:
