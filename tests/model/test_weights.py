@@ -82,6 +82,8 @@ def test_bundled_weights_say_what_they_are_for_and_where_they_come_from(name):
     assert all({"seed", "joint_pairs"} <= set(run["training"]["schedule"]) for run in card["runs"])
     assert find_weights(name).stat().st_size < 20e6
     assert ("calibration" in card) == (name == "utopic")
+    asked = {one["command"].split()[2] for one in card["measured"] if one["result"]}
+    assert {"range-scans", "modelnet", "modelonet", "confidence"} <= asked
     assert model.verifier is not None
 
 

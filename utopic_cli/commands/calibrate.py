@@ -55,6 +55,7 @@ def calibrate(
         step("starting")
         options = AlignOptions(weights=str(path), points=points, device=device, seed=seed)
         found = fit(shapes, data, trials, seed, options, workers, countdown(step))
+    card.pop("measured", None)  # with the calibration before
     completed = json.dumps({**card, "calibration": found.as_dict()}, indent=2, allow_nan=False) + "\n"
     write_atomically(card_path, completed.encode("utf-8"), overwrite=True)
     seen = found.description["out_of_fold"]

@@ -67,7 +67,7 @@ def teach(
         )
         if start_from is not None:
             described["before"] = before
-    old = ("name", "sha256", "calibration")  # of the file as it was
+    old = ("name", "sha256", "calibration", "measured")  # of the file as it was
     card = {name: value for name, value in card.items() if name not in old}
     blob, text = pack_weights(model, {**card, "verifier": described})
     write_together({card_path: text, path: blob}, overwrite=True)
