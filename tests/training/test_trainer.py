@@ -222,8 +222,9 @@ def test_a_checkpoint_that_does_not_say_where_it_began_is_resumed(shapes, tmp_pa
     state = read_checkpoint(tmp_path / "checkpoint.pt")
     del state["start"], state["before"]
     write_checkpoint(tmp_path / "checkpoint.pt", state)
-    run(shapes, tmp_path, resume=True)
+    path = run(shapes, tmp_path, resume=True)
     assert read_checkpoint(tmp_path / "checkpoint.pt")["pairs"] == total_pairs(SCHEDULE)
+    assert load_weights(str(path))[1]["runs"][-1]["start"] == "unknown"
 
 
 def test_batches_depend_on_seed_and_number_alone(shapes):

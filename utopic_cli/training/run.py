@@ -142,7 +142,7 @@ def start_run(
         run.optimiser.load_state_dict(state["optimiser"])
         run.average.restore(state["average"])
         run.done, run.elapsed = state["pairs"], state["elapsed_s"]
-        run.start, run.before = state.get("start", RANDOM), state.get("before", [])  # older ones lack them
+        run.start, run.before = state.get("start", "unknown"), state.get("before", [])  # older
     return run
 
 
